@@ -10,9 +10,8 @@ from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy, policy_file, read_policy
 from cfp.presets import DEFAULT_TASK, from_json, like_start
-from cfp.weights import policy_file, read_policy
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`.
 ALGORITHMS: dict[str, str] = {

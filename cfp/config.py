@@ -10,8 +10,8 @@ from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
 import dittogym.tasks
+from cfp.agent.actor import ActorSpec
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
-from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import differences, flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
@@ -200,8 +200,8 @@ class StagedConfig(RunConfig):
     def ineffective(self) -> dict[str, str]:
         """Options without effect under the others: a single stage has no gate."""
         single = {"network.gate_scale": "several resolutions"} if len(self.resolutions) == 1 else {}
-        lean = {"network.split": "encoder full"} if self.network.encoder == "lean" else {}
-        return super().ineffective() | single | lean
+        small = {"network.split": "encoder paper"} if self.network.encoder == "small" else {}
+        return super().ineffective() | single | small
 
     def check(self) -> None:
         """Check what the types do not express."""

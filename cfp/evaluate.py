@@ -15,19 +15,17 @@ import tyro
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
-from cfp.evaluation.results import format_table, to_rows
-from cfp.evaluation.returns import Noise, compare, evaluation_seed, without_noise
+from cfp.evaluation.returns import Noise, compare, evaluation_seed, format_table, to_rows, without_noise
 from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.training import Program
 from cfp.files import check_output
 from cfp.from_dict import update_from_dict
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy, is_of_another_task, policy_file, shipped
 from cfp.sections import Particles
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
-from cfp.weights import is_of_another_task, policy_file, shipped
 from dittogym.trajectories import Episode, save_episodes
 from dittogym.trajectories.episode import record_batch
 

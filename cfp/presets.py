@@ -17,8 +17,8 @@ from cfp.analytic.reward import RewardConfig
 from cfp.config import CoarseToFineConfig, Learner, Preset, SACConfig, check_task
 from cfp.errors import ConfigError
 from cfp.from_dict import Options, update_from_dict
+from cfp.policy import load
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
-from cfp.weights import load
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def _quick(task: str, numbers: TaskNumbers) -> SACConfig:
         critics_first=0.5,
         max_episode_steps=max(30, horizon // 4),
         environment=EnvironmentConfig(),
-        network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
+        network=replace(paper.network, interpolation="half_pixel", encoder="small"),
         learning=LearningConfig(
             batch_size=64 if many else 128,
             learning_rate=5e-4,
@@ -265,9 +265,9 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
         return base
     if {option.name for option in fields(base)} <= values.keys():  # those of a run, whose start may be gone by now
         return base
-    spec, lean = load(values["start_from"]).spec, base.network.encoder == "lean"
+    spec, small = load(values["start_from"]).spec, base.network.encoder == "small"
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
-    if isinstance(base, SACConfig) and lean and spec.encoder != "lean":
+    if isinstance(base, SACConfig) and small and spec.encoder != "small":
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average")}
         learning = replace(base.learning, gradient_steps=4, batch_size=64, noise_cells=0, **usual)
         base = replace(base, learning=learning, max_episode_steps=None)

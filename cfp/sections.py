@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from cfp.agent.spec import EncoderKind, Interpolation
+from cfp.agent.actor import EncoderKind, Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_positive
 from dittogym.action import ActionIndexing, default_indexing
@@ -110,7 +110,7 @@ class EnvironmentConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Options of the networks, see `cfp.agent.spec.ActorSpec`."""
+    """Options of the networks, see `cfp.agent.actor.ActorSpec`."""
 
     interpolation: Interpolation = "half_pixel"
     """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
@@ -118,8 +118,8 @@ class NetworkConfig:
     """Separate narrow encoders for observation and action."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
-    encoder: EncoderKind = "full"
-    """full (the paper's), or lean (half the size and width; actions join its features)."""
+    encoder: EncoderKind = "paper"
+    """paper (the paper's), or small (half the size and width; actions join its features)."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""

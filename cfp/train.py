@@ -9,8 +9,8 @@ from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.learner import AnalyticLearner
 from cfp.experiment import training
 from cfp.experiment.sac_learner import SACLearner
+from cfp.policy import load
 from cfp.presets import from_json
-from cfp.weights import load
 
 PROGRAM = training.Program(
     "cfp",

@@ -13,7 +13,7 @@ import numpy as np
 
 import cfp
 import dittogym
-from cfp.weights import SHIPPED, shipped
+from cfp.policy import SHIPPED, shipped
 from dittogym.render.film import write_film
 from dittogym.render.recording import Recording
 from dittogym.tasks import headline

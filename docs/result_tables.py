@@ -13,7 +13,7 @@ import dittogym
 from baselines.compare import paper
 from baselines.leaderboard.__main__ import rankings
 from baselines.leaderboard.submission import read_submissions
-from cfp import weights
+from cfp import policy as weights
 from dittogym.tasks import headline
 
 DOCS = Path(__file__).resolve().parent

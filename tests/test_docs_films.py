@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cfp.weights import SHIPPED, shipped
+from cfp.policy import SHIPPED, shipped
 
 FILMS = Path(__file__).resolve().parents[1] / "docs" / "images" / "films"
 

@@ -9,11 +9,9 @@ from typing import Any, cast
 import numpy as np
 from torch import Tensor
 
-from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.experiment.algorithm import Algorithm
-from cfp.files import write_policy
 from cfp.hub import Shareable
-from cfp.weights import read_policy, report_mismatch
+from cfp.policy import Memory, Observation, Start, read_policy, report_mismatch, write_policy
 
 
 class OpenLoop(Shareable):

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
-from cfp.evaluation.untrained import UntrainedPolicy
-from cfp.policy_protocols import Policy
+from cfp.evaluation.returns import UntrainedPolicy
+from cfp.policy import Policy
 from cfp.presets import sac_preset
 from cfp.sections import ReportConfig
 from dittogym import make_spec

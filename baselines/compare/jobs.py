@@ -16,8 +16,8 @@ from cfp.experiment.folder import holds_run, policy_path, read_config
 from cfp.experiment.training import decisive
 from cfp.files import read_json
 from cfp.from_dict import differences, flatten, leaf_names
+from cfp.policy import is_of_another_task, is_same_task, read_policy
 from cfp.sections import TASK_OPTIONS
-from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
 #: The layouts of training count on from the seed, and those of evaluations from ``EVALUATION_SEED``.

@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from baselines.compare import paper, plots, tables
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.results import Group, RunResult, group_results
-from cfp.evaluation.page import STYLE
-from cfp.evaluation.plots import write_figure
-from cfp.evaluation.table import Table
+from cfp.evaluation.page import STYLE, write_figure
 from cfp.files import write_text
 from cfp.sections import Particles
+from cfp.tables import Table
 
 TABLE_STYLE = """
 body { max-width: 76rem; } table { font-size: 14px; } th { vertical-align: bottom; }

@@ -8,8 +8,8 @@ import numpy as np
 from baselines.compare import paper
 from baselines.compare.results import Group, RunResult
 from baselines.compare.stats import align_curves, first_step_at, interquartile_mean, score_interval, wilson_interval
-from cfp.evaluation.table import Column, Row, Table, columns, make_row
 from cfp.sections import Particles
+from cfp.tables import Column, Row, Table, columns, make_row
 from dittogym import make_spec
 
 #: Fractions of the way from a resting robot to the best curve, for sample efficiency.

@@ -19,7 +19,6 @@ from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entri
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.mpc import planner_preset
 from cfp.agent.actor import Actor, build_actor
-from cfp.agent.actor_policy import ActorPolicy
 from cfp.analytic.critic import descend
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful
@@ -32,8 +31,8 @@ from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, copy_coarse_weights
+from cfp.policy import ActorPolicy, load
 from cfp.presets import sac_preset
-from cfp.weights import load
 from dittogym import make_spec
 
 #: Every scalar that ``Distill.update`` logs, and what it means.
@@ -179,7 +178,7 @@ class Distill(Stateful, CoarseToFineStages):
             handover=(steps // 2,),
             resolutions=base.resolutions,
             gate_bias=base.gate_bias,
-            network=replace(base.network, encoder="full"),
+            network=replace(base.network, encoder="paper"),
             student_noise=not base.report.eval_deterministic,
             dropout=0.2,
             planner=planner,

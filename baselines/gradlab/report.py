@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from baselines.gradlab.measure import COLUMNS, STEP_SIZES, Result
-from cfp.evaluation.plots import write_figure
+from cfp.evaluation.page import write_figure
 from cfp.files import write_json, write_text
 from cfp.tables import csv_text
 

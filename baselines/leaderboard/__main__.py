@@ -11,8 +11,8 @@ from baselines.compare.results import SEES
 from baselines.compare.tables import rank
 from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.leaderboard.submission import Submission, read_submissions
-from cfp.evaluation.table import Table, columns
 from cfp.experiment.cli import read_command, run_command
+from cfp.tables import Table, columns
 
 COLUMNS = (
     *columns("d", rank="rank"),

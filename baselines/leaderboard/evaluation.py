@@ -14,13 +14,12 @@ from baselines.leaderboard.submission import Scores, Submission, Training, read_
 from baselines.registry import configure, load, reference_policy, sees
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
-from cfp.evaluation.episodes import Trial, play
+from cfp.evaluation.returns import Trial, play
 from cfp.experiment.folder import make_folder
 from cfp.files import write_json
 from cfp.hub import is_address
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy, check_trained_for, policy_file, shipped
 from cfp.sections import EnvironmentConfig
-from cfp.weights import check_trained_for, policy_file, shipped
 from dittogym.action import trained_indexing
 
 #: Name under which the policy of the package with a task's own name is submitted.

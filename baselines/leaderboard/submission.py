@@ -9,8 +9,7 @@ from pathlib import Path
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.leaderboard.protocol import PROTOCOLS
 from cfp.errors import ConfigError
-from cfp.evaluation.results import numbers
-from cfp.evaluation.returns import Result
+from cfp.evaluation.returns import Result, numbers
 from cfp.experiment.algorithm import Sees
 from cfp.files import read_json
 from cfp.from_dict import update_from_dict

@@ -11,14 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from baselines.common.policies import StateBasedPolicy, load_network
-from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import Memory
-from cfp.agent.networks import LATENT, Encoder, initialise
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import LATENT, Actor, ActorSpec, Encoder, initialise
 from cfp.analytic.critic import mlp
 from cfp.analytic.features import StateFeatures
-from cfp.files import write_policy
-from cfp.weights import read_policy, report_mismatch
+from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -61,7 +57,7 @@ class StatePolicy(StateBasedPolicy):
     """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
 
     ``noise`` is the standard deviation before tanh of actions that are not deterministic; ``description`` says what the
-    policy is and where it comes from, see `cfp.weights.describe_run`.
+    policy is and where it comes from, see `cfp.policy.describe_run`.
     """
 
     def __init__(

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from baselines.common.grid import GridConfig
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic
-from cfp.agent.actor_policy import ActorPolicy, image_policy
 from cfp.analytic.config import WindowConfig
 from cfp.analytic.critic import BETAS, Critic, mlp
 from cfp.analytic.features import StateFeatures
@@ -26,10 +25,10 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
 from cfp.experiment.folder import start_path
 from cfp.experiment.schedules import linear_decay
+from cfp.policy import KIND, ActorPolicy, copy_policy, load, policy_for, read_policy
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
-from cfp.weights import KIND, copy_policy, load, policy_for, read_policy
 
 #: Updates in a row without a finite gradient after which training gives up.
 PATIENCE = 10
@@ -181,7 +180,7 @@ class Shac(Stateful, Algorithm):
         deterministic = self.config.report.eval_deterministic
         if isinstance(self.actor, StateActor):
             return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
-        return image_policy(self.actor.spec, self.actor.actor, deterministic)
+        return ActorPolicy(self.actor.spec, deterministic, self.actor.actor)
 
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
@@ -221,8 +220,8 @@ class Shac(Stateful, Algorithm):
         policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
-        if policy.spec.encoder != "full":
-            raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
+        if policy.spec.encoder != "paper":
+            raise ConfigError(f"start_from must be a policy with encoder paper, got {policy.spec.encoder}")
         copy_policy(config.start_from, start_path(folder))
         return Position()
 

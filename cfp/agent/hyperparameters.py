@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cfp.agent.spec import RESOLUTIONS
+from cfp.agent.actor import RESOLUTIONS
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from cfp.agent.actor import Actor
-from cfp.agent.lean import NetworkInput, image_of
-from cfp.agent.networks import TwinCritic
+from cfp.agent.actor import Actor, NetworkInput, image_of
+from cfp.agent.critics import TwinCritic
 
 
 def critic_target(

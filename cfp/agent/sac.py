@@ -21,15 +21,13 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from cfp.agent.actor import Actor
-from cfp.agent.composition import Composition
+from cfp.agent.actor import Actor, NetworkInput, upsample
+from cfp.agent.critics import TwinCritic
 from cfp.agent.exploration import CellNoise
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.lean import NetworkInput
 from cfp.agent.losses import actor_loss, critic_loss, critic_target
-from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
-from cfp.agent.replay import ReplayRing
+from cfp.agent.replay import Composition, ReplayRing
 from cfp.agent.reward_statistics import RewardStatistics
 from cfp.errors import NonFiniteError
 

@@ -24,7 +24,7 @@ from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
-from cfp.evaluation.pictures import policy_pictures
+from cfp.evaluation.page import policy_pictures
 from cfp.experiment.algorithm import Scalars
 from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, refines

@@ -18,7 +18,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy
 
 #: What a policy may look at: the observation; the full state; the simulator, to plan with; nothing.
 Sees = Literal["image", "state", "simulator", "nothing"]

@@ -18,13 +18,13 @@ from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
-from cfp.evaluation.pictures import policy_pictures
+from cfp.evaluation.page import policy_pictures
 from cfp.experiment.algorithm import Algorithm, Scalars
 from cfp.experiment.folder import start_path
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
 from cfp.experiment.stages import CoarseToFineStages, refines
+from cfp.policy import load
 from cfp.presets import sac_preset
-from cfp.weights import load
 
 #: Scalars logged beside ``cfp.agent.sac.METRICS`` and ``cfp.experiment.callbacks.LOG_METRICS``.
 ROLLOUT_METRICS: dict[str, str] = {
@@ -67,7 +67,7 @@ class SACAlgorithm(Algorithm):
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage before actor updates (a lean encoder learns earlier)."""
+        """Environment steps at the beginning of the stage before actor updates (the small encoder learns earlier)."""
         return max(self.model.hyperparameters.actor_start, self.model.hyperparameters.update_start)
 
     @classmethod

@@ -7,15 +7,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import ActorPolicy, image_policy
-from cfp.agent.lean import LeanEncoder
+from cfp.agent.actor import Actor, SmallEncoder
 from cfp.config import StagedConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.folder import policy_path, start_path
-from cfp.files import write_policy
-from cfp.weights import KIND, copy_policy, load, policy_for, read_policy, report_mismatch
+from cfp.policy import (
+    KIND,
+    ActorPolicy,
+    copy_policy,
+    load,
+    policy_for,
+    read_policy,
+    report_mismatch,
+    write_policy,
+)
 
 
 class CoarseToFineStages(Algorithm):
@@ -57,7 +63,7 @@ class CoarseToFineStages(Algorithm):
     def policy(self) -> ActorPolicy:
         """What has been learned so far."""
         spec, deterministic = self.config.actor_spec(self.stage), self.config.report.eval_deterministic
-        return image_policy(spec, self.trained_actor, deterministic)
+        return ActorPolicy(spec, deterministic, self.trained_actor)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
@@ -80,9 +86,9 @@ class CoarseToFineStages(Algorithm):
 
 
 def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
-    """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
+    """Copy a trained coarse actor into the new stage above it, and its small encoder too."""
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
-    if isinstance(actor.encoder, LeanEncoder):  # heads and critics start from trained features
+    if isinstance(actor.encoder, SmallEncoder):  # heads and critics start from trained features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())
 
 

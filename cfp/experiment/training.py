@@ -23,7 +23,7 @@ from cfp.experiment.run import TrainingRun, check_options
 from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
 from cfp.from_dict import flatten, leaf_names, update_from_dict
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy
 
 #: Options that the help shows first.
 BASIC = ("task", "target", "algo", "preset", "learner", "steps", "seed", "device", "out", "resume")

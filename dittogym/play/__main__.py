@@ -49,13 +49,13 @@ class Command:
 
 def load_policy(path: str) -> Any:
     """A policy of any kind. The packages that load them depend on this one, so they are looked up by name."""
-    kind = pkgutil.resolve_name("cfp.weights:read_policy")(path)[1]["kind"]
+    kind = pkgutil.resolve_name("cfp.policy:read_policy")(path)[1]["kind"]
     return pkgutil.resolve_name("cfp:load" if kind == "cfp" else "baselines:load")(path)
 
 
 def options(command: Command) -> dict[str, Any]:
     """Arguments of :class:`dittogym.play.session.Session`."""
-    weights = pkgutil.resolve_name("cfp.weights")
+    weights = pkgutil.resolve_name("cfp.policy")
     known = {name: weights.read_policy(name)[1] for name in weights.shipped()}
     chosen: dict[str, Any] = {}
     if command.policy is not None:

@@ -46,7 +46,7 @@ def test_presets_follow_the_learner_and_the_policy_to_start_from():
     }
     gradients, refined, late = (resolve(Plan(algos=algos), name, "run", "quick", 0, None, "cpu") for name in algos)
     assert (gradients.learner, gradients.handover) == ("analytic", (4800,))
-    assert (refined.resolutions, refined.network.encoder, refined.learning.batch_size) == ((8,), "full", 64)
+    assert (refined.resolutions, refined.network.encoder, refined.learning.batch_size) == ((8,), "paper", 64)
     assert late.learning.actor_start == 4000
 
 
@@ -78,7 +78,7 @@ def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp
         assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
         error = capsys.readouterr().err
         assert f"{label} on run: noise_cells requires " in error
-    full = {"network": {"encoder": "full"}}
+    full = {"network": {"encoder": "paper"}}
     plan = {"common": idle, "algos": {"cfp": full, "coarse": full, "gnn-16": {"learning": {"noise_cells": 0}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
 

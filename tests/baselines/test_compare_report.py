@@ -16,8 +16,8 @@ from baselines.compare.report import make_tables
 from baselines.compare.results import group_results, read_result
 from baselines.compare.tables import aggregate_table, cost_table, efficiency_table, paper_table
 from cfp.config import to_json
-from cfp.files import write_json, write_policy, write_text
-from cfp.weights import describe_run
+from cfp.files import write_json, write_text
+from cfp.policy import describe_run, write_policy
 
 LABELS = ["zero", "cfp", "shac", "shac-image"]
 PLAN = {"algos": {"shac-image": {"algo": "shac", "sees": "image"}}}

@@ -25,10 +25,9 @@ from baselines.registry import configure
 from cfp.analytic.episodes import Episodes
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
-from cfp.files import write_policy
+from cfp.policy import describe_run, read_policy, write_policy
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
-from cfp.weights import describe_run, read_policy
 from dittogym import TorchEnv
 from dittogym.action import patch_field, to_grid_indexing
 

@@ -20,10 +20,10 @@ from baselines.leaderboard.submission import Scores, Submission, Training, read_
 from cfp.agent.actor import build_actor
 from cfp.config import EVALUATION_SEED, LARGEST_SEED
 from cfp.errors import ConfigError
-from cfp.evaluation.cache import Episode
+from cfp.evaluation.returns import Played
 from cfp.files import write_json
+from cfp.policy import SHIPPED, shipped
 from cfp.presets import preset
-from cfp.weights import SHIPPED, shipped
 
 COMMITTED = Path(__file__).resolve().parents[2] / "docs" / "leaderboard"
 RETURNS = tuple(float(value) for value in range(100, 108))
@@ -149,7 +149,7 @@ def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path, monke
         envs = [trials[0].make_env(seed, 1) for seed in PROTOCOLS["v1"].seeds]
         for env in envs:
             env.reset()
-        return [[Episode(float(env.unwrapped.torch_env.state.x.shape[1]), False) for env in envs]]
+        return [[Played(float(env.unwrapped.torch_env.state.x.shape[1]), False) for env in envs]]
 
     monkeypatch.setattr(leaderboard.evaluation, "play", count_particles)
     assert compare(f"--protocol v1 --tasks obstacle grow --out {tmp_path} --policies zero".split()) == 0

@@ -6,7 +6,7 @@ import baselines
 from baselines import OpenLoop
 from baselines.registry import configure
 from cfp.errors import CheckpointError
-from cfp.weights import describe_run
+from cfp.policy import describe_run
 
 
 @pytest.fixture

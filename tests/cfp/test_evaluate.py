@@ -1,4 +1,4 @@
-"""Evaluations: the same digits however episodes are spread over threads, and baselines that are played once."""
+"""Evaluations: the same digits however episodes are spread over threads, and what may be chosen for them."""
 
 import threading
 from dataclasses import replace
@@ -11,10 +11,7 @@ from fakes import FakeEnv
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
-from cfp.evaluation.cache import VARIABLE
-from cfp.evaluation.episodes import Trial
-from cfp.evaluation.returns import compare, evaluate, make_trial
-from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
 from cfp.train import PROGRAM
 from dittogym import TorchEnv
@@ -131,41 +128,6 @@ def test_an_episode_that_fails_ends_the_others():
     finally:
         torch.set_num_threads(threads)
     assert threading.active_count() == before and policies[0].steps < 10**6
-
-
-def test_baselines_are_played_once_for_the_same_conditions(short, tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, str(tmp_path))
-    seen = []
-    step = TorchEnv.step
-
-    def counted(self, action, **options):
-        seen.append(0)
-        return step(self, action, **options)
-
-    monkeypatch.setattr(TorchEnv, "step", counted)
-
-    def steps_of(config, episodes=2):
-        seen.clear()
-        results = compare(config, {}, episodes)
-        return len(seen), results
-
-    count, results = steps_of(tiny())
-    assert count == 2 * 2 * 6
-    assert steps_of(tiny()) == (0, results)
-    assert steps_of(replace(tiny(), environment=replace(tiny().environment, num_envs=7))) == (0, results)
-    assert steps_of(tiny(), 3)[0] == 2 * 6  # a further layout each
-    assert steps_of(replace(tiny(), seed=1))[0] == 0  # which are among those
-    for other in (tiny("kick"), tiny(particles=300), tiny(substeps=3), tiny(parity="reference")):
-        assert steps_of(other)[0] == 24
-    for file in tmp_path.glob("*.json"):
-        file.write_text("{")
-    assert steps_of(tiny()) == (24, results) and steps_of(tiny()) == (0, results)  # what is damaged is played again
-    monkeypatch.setattr("cfp.evaluation.cache._sources", lambda: "other sources")
-    assert steps_of(tiny())[0] == 24
-    monkeypatch.setenv(VARIABLE, "")
-    assert steps_of(tiny()) == (24, results)
-    monkeypatch.setenv(VARIABLE, __file__)  # no folder
-    assert steps_of(tiny()) == (24, results)
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():
