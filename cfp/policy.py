@@ -305,9 +305,15 @@ def _check_description(description: Any) -> None:
         elif not isinstance(value, allowed):
             raise ConfigError(f"{name} must be {type_name(allowed)}, got {value!r}")
     environment = description["environment"]
-    if environment.pop("parity", None) == "reference":  # trained with the reference's faults, whose actions are rotated
-        environment["action_layout"] = environment.get("action_layout") or "grid"
-    update_from_dict(EnvironmentConfig(), environment, "environment")
+    faulty = environment.pop("parity", "clean") == "reference"  # trained with faults of the reference, which are gone
+    if environment.get("action_layout") is None:
+        environment["action_layout"] = "grid" if faulty else "image"
+    environment_of(description)
+
+
+def environment_of(description: Mapping[str, Any]) -> EnvironmentConfig:
+    """The environment in which the policy with a description was trained."""
+    return update_from_dict(EnvironmentConfig(), description["environment"], "environment")
 
 
 def _translated(description: dict[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
@@ -394,7 +400,7 @@ def check_trained_for(option: str, description: Mapping[str, Any], task: str, en
     """Check that a policy, named by an option, was trained for a task, its target, material and control step."""
     if (found := description["task"]) != task:
         raise ConfigError(f"{option} must be a policy for {task}, got one for {found}")
-    own = update_from_dict(EnvironmentConfig(), description["environment"])
+    own = environment_of(description)
     if not math.isclose(found := own.control_step, allowed := environment.control_step):
         raise ConfigError(f"{option} must be a policy for environment steps of {allowed} s, got {found}")
     for name in TASK_OPTIONS:

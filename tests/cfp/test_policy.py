@@ -125,11 +125,7 @@ def test_the_duration_of_a_step_must_be_that_of_the_training():
         ({"dt": 2e-4, "substeps": 50}, {}, True),
         ({"substeps": 50}, {}, False),
     ):
-        with (
-            nullcontext()
-            if fits
-            else pytest.raises(ConfigError, match="teacher must be a policy for")
-        ):
+        with nullcontext() if fits else pytest.raises(ConfigError, match="teacher must be a policy for"):
             check_trained_for("teacher", {"task": "run", "environment": own}, "run", EnvironmentConfig(**here))
 
 
