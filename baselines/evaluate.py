@@ -1,12 +1,16 @@
-"""``python -m baselines.evaluate RUN_FOLDER``: evaluate a policy of any algorithm, those of `cfp` included."""
+"""``torchmpm evaluate``: `cfp.evaluate` for policies of any algorithm."""
 
 import sys
-from functools import partial
+from collections.abc import Sequence
 
-from baselines.train import PROGRAM
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from cfp import evaluate
 
-main = partial(evaluate.main, program=PROGRAM)
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    return evaluate.main(arguments, "baselines.evaluate")
+
 
 if __name__ == "__main__":
     sys.exit(main())

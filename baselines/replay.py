@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from baselines.train import PROGRAM
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.video import check_files, record_policy
@@ -32,7 +32,7 @@ def run(command: Command) -> None:
     check_files({"out": command.out}, {})
     if command.out.suffix == ".mp4" and not available():
         raise ConfigError("out needs the extra video for .mp4 (pip install 'torchmpm[video]'), or another suffix")
-    config, policies = command.open(PROGRAM)
+    config, policies = command.open()
     check_output("out", command.out)
     print(f"episode: {record_policy(config, list(policies.values())[-1], command.noise).save(command.out)}")
 

@@ -1,12 +1,16 @@
-"""``python -m baselines.robustness RUN_FOLDER``: `cfp.robustness` for a policy of any algorithm."""
+"""``torchmpm robustness``: `cfp.robustness` for policies of any algorithm."""
 
 import sys
-from functools import partial
+from collections.abc import Sequence
 
-from baselines.train import PROGRAM
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from cfp import robustness
 
-main = partial(robustness.main, program=PROGRAM)
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    return robustness.main(arguments, "baselines.robustness")
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import Any, ClassVar
+from typing import Any
 
-from baselines.train import PROGRAM
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from cfp import runs
-from cfp.experiment.training import Program
+from cfp.runs import Run
 
-
-class Run(runs.Run):
-    """A run of any algorithm in its folder, with the members of `cfp.Run`.
-
-    Args:
-        folder: Where a training, from Python or from the command line, wrote it.
-
-    Raises:
-        CheckpointError: There is no run.
-    """
-
-    program: ClassVar[Program] = PROGRAM
+__all__ = ["Run", "fit"]
 
 
 def fit(
@@ -31,8 +20,8 @@ def fit(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     **options: Any,
-) -> runs.Run:
-    """Train an algorithm, as ``python -m baselines.train`` does; see `cfp.fit`.
+) -> Run:
+    """Train an algorithm, as ``torchmpm train`` does; see `cfp.fit`.
 
     Args:
         algo: A name in `ALGORITHMS`.
@@ -40,8 +29,7 @@ def fit(
         steps: Environment steps, for algorithms with this option; None: those of the preset.
         out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
         resume: Continue the run in the folder.
-        options: Options of the command line with underscores; ``python -m baselines.train --algo NAME --help`` lists
-            them.
+        options: Options of the command line with underscores; ``torchmpm train --algo NAME --help`` lists them.
 
     Returns:
         The finished run.
@@ -50,6 +38,4 @@ def fit(
         ConfigError: An option does not exist or is wrong.
         NonFiniteError: Training has diverged.
     """
-    if steps is not None:
-        options["steps"] = steps
-    return Run.fit({"algo": algo, "task": task, **options}, out, resume)
+    return runs.fit(task, steps=steps, out=out, resume=resume, algo=algo, **options)

@@ -4,25 +4,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from cfp.agent.actor import ActorSpec
-from cfp.agent.hyperparameters import Hyperparameters
-from cfp.analytic.config import AnalyticConfig
-from cfp.config import CoarseToFineConfig, SACConfig
+from cfp.config import AnalyticConfig, CoarseToFineConfig, Hyperparameters, SACConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.policy import ActorPolicy, load
 from cfp.presets import preset
 
 if TYPE_CHECKING:
     from cfp.agent.features import ImageFeatures
-    from cfp.agent.policies import CFPPolicy
-    from cfp.agent.sac import CFP
+    from cfp.analytic.learner import CFPAnalytic
     from cfp.envs.vec_env import TorchVecEnv
     from cfp.runs import Run, fit
+    from cfp.sac.algorithm import CFP
+    from cfp.sac.policies import CFPPolicy
 
 __all__ = [
     "CFP",
     "ActorPolicy",
     "ActorSpec",
     "AnalyticConfig",
+    "CFPAnalytic",
     "CFPError",
     "CFPPolicy",
     "CheckpointError",
@@ -41,8 +41,9 @@ __all__ = [
 
 # Imported on first use: loading a policy needs neither stable-baselines3 nor TensorBoard, which it imports.
 _ON_FIRST_USE = {
-    "CFP": "cfp.agent.sac",
-    "CFPPolicy": "cfp.agent.policies",
+    "CFP": "cfp.sac.algorithm",
+    "CFPAnalytic": "cfp.analytic.learner",
+    "CFPPolicy": "cfp.sac.policies",
     "ImageFeatures": "cfp.agent.features",
     "Run": "cfp.runs",
     "fit": "cfp.runs",

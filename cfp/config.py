@@ -1,60 +1,116 @@
-"""The options of a training run as frozen dataclasses, and their JSON form."""
+"""The options of trainings: one flat dataclass for each algorithm, whose defaults are `cfp.presets`."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+import typing
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
+
+from typeguard import TypeCheckError, check_type
 
 import dittogym.tasks
-from cfp.agent.actor import ActorSpec
-from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
+from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
 from cfp.errors import ConfigError
-from cfp.from_dict import differences, flatten
-from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
-from cfp.validation import check_at_least, check_decay
+from cfp.validation import brief, check_at_least, check_decay, check_fraction, check_positive
 from dittogym import make_spec
-from dittogym.spec import TaskSpec
+from dittogym.action import ActionIndexing
+from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import task_name
 
 Preset = Literal["quick", "long", "paper"]
-Learner = Literal["analytic", "sac"]
+#: Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object.
+Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
+Options = TypeVar("Options")
 
 LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
 EVALUATION_SEED = 10_000
-#: Entry of ``RunConfig.ineffective`` where every episode begins on a layout that is counted from the seed.
-RESAMPLE_NEEDS_SAC = {
-    "environment.resample": "soft actor-critic (learner sac, or algo coarse, fine, gnn-*, transformer-*)"
-}
+#: Fields of `EnvironmentConfig` that are options of some tasks only.
+TASK_OPTIONS = ("target", "variant")
 
 
-@dataclass(frozen=True)
-class RunConfig:
-    """Options of a training run that every algorithm has; its stages are counted from 1."""
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentConfig:
+    """Options of `dittogym.TorchEnv`."""
+
+    num_envs: int = 16
+    """Number of robots simulated side by side."""
+    particles: Particles = "lite"
+    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
+    substeps: int | None = None
+    """Substeps of a control step; None: as many as take 10 ms."""
+    dt: float = DT
+    """Duration of a substep, s."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the physics."""
+    backend: str = "auto"
+    """Backend of the physics: auto, eager, ..."""
+    action_layout: ActionIndexing = "image"
+    """Orientation of the action array: image (as the observation) or grid (the reference's)."""
+    resample: bool = False
+    """Draw the particles anew at every reset; only with soft actor-critic."""
+    target: str | None = None
+    """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
+    variant: str | None = None
+    """For tasks that have variants: in SLOT the material, that of the registered environment (registered, also None) or
+    of the published training run (published)."""
+
+    def task_options(self) -> dict[str, Any]:
+        """The options that belong to the task, for `dittogym.make_spec`."""
+        return {name: value for name in TASK_OPTIONS if (value := getattr(self, name)) is not None}
+
+    @property
+    def control_step(self) -> float:
+        """Duration of an environment step, s."""
+        return CONTROL_STEP if self.substeps is None else self.substeps * self.dt
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """What is learned by what."""
 
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
-    algo: str = "cfp"
+    algo: str
     """Name of the algorithm."""
     preset: Preset = "quick"
     """Set of default options: quick (minutes), paper (the published values), or long (a night; only for algorithms that
-    learn by soft actor-critic). With paper and long CFP has learner sac."""
+    learn by soft actor-critic)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
     """cpu, cuda, or auto."""
-    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(EnvironmentConfig, TaskConfig):
+    """Options of a training that every algorithm has; its stages are counted from 1."""
+
+    eval_every: int = 10_000
+    """Environment steps between evaluations; 0: none."""
+    eval_episodes: int = 5
+    """Episodes of an evaluation and of the final table."""
+    eval_deterministic: bool = False
+    """Evaluate without action noise."""
+    checkpoint_every: int = 1_000
+    """Environment steps between checkpoints."""
+    log_every: int = 500
+    """Environment steps between rows of progress.csv and TensorBoard points."""
+    video: bool = True
+    """Record video.mp4 at the end."""
+    video_every: int = 0
+    """Environment steps between videos of one episode in videos/; 0: none."""
+    wandb: Literal["off", "offline", "online"] = "off"
+    """Weights & Biases: off, offline (kept in the folder of the run), or online (uploads)."""
+    wandb_project: str = "torchmpm"
+    """Weights & Biases project."""
 
     changeable: ClassVar[tuple[str, ...]] = (
-        "device",
-        *(f"report.{name}" for name in ("eval_every", "patience", "checkpoint_every", "log_every")),
-        *(f"report.{name}" for name in ("video", "video_every", "wandb", "wandb_project")),
-        "environment.backend",
+        *("device", "backend", "eval_every", "checkpoint_every", "log_every"),
+        *("video", "video_every", "wandb", "wandb_project"),
     )
     """Options that a resumed run may change."""
 
@@ -65,16 +121,29 @@ class RunConfig:
 
     def make_spec(self) -> TaskSpec:
         """The task, with its options."""
-        return make_spec(self.task, **self.environment.task_options())
+        return make_spec(self.task, **self.task_options())
 
     @property
-    def training_environment(self) -> EnvironmentConfig:
-        """Options of the simulations in training."""
-        return self.environment
+    def environment(self) -> EnvironmentConfig:
+        """The options of the environment alone."""
+        names = (option.name for option in dataclasses.fields(EnvironmentConfig))
+        return EnvironmentConfig(**{name: getattr(self, name) for name in names})
 
-    def for_training(self) -> RunConfig:
-        """These options, with the simulations of training as the environment."""
-        return replace(self, environment=self.training_environment)
+    def for_training(self: Config) -> Config:
+        """These options, with the environment that is trained in."""
+        return self
+
+    def simulated_with(self: Config, particles: Particles | None = None, dt: float | None = None) -> Config:
+        """These options with other particles, and with the same environment step in substeps of ``dt`` s, if given."""
+        config = self if particles is None else replace(self, particles=particles)
+        if dt is None or dt == self.dt:
+            return config
+        check_positive(train_dt=dt)
+        ratio = self.control_step / dt
+        substeps = round(ratio) if math.isfinite(ratio) else 0
+        if not math.isclose(substeps * dt, self.control_step):
+            raise ConfigError(f"train_dt must divide an environment step of {self.control_step} s, got {dt}")
+        return replace(config, dt=dt, substeps=substeps)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
@@ -95,23 +164,7 @@ class RunConfig:
 
     def evaluation(self, stage: int) -> tuple[int, int]:
         """Seed of the first episode, and number of episodes, of the evaluations during a stage."""
-        return self.seed + EVALUATION_SEED, self.report.eval_episodes
-
-    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """These options, with those that follow from others in the preset ``base`` computed anew unless given."""
-        return self
-
-    def ineffective(self) -> dict[str, str]:
-        """Options without effect under the others, and what they require (a trailing dot: the whole section)."""
-        return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
-
-    def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
-        """Refuse options, all or those ``given``, that differ from the preset ``base`` but are `ineffective`."""
-        ineffective = self.ineffective()
-        for name, (value, _) in differences(to_json(self), to_json(base)).items():
-            for option, required in ineffective.items():
-                if name.startswith(option) and (given is None or name in given):
-                    raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
+        return self.seed + EVALUATION_SEED, self.eval_episodes
 
     def check(self) -> None:
         """Check what the types do not express.
@@ -120,48 +173,58 @@ class RunConfig:
             ConfigError: An option is wrong.
         """
         check_task(self.task)
-        for name, value in flatten(to_json(self)).items():  # JSON files and command lines can contain NaN and infinity
+        for name, value in vars(self).items():  # JSON files and command lines can contain NaN and infinity
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, float) and not math.isfinite(number):
-                    raise ConfigError(f"{name.split('.')[-1]} must be finite, got {value}")
+                    raise ConfigError(f"{name} must be finite, got {value}")
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
-        for option in dataclasses.fields(self):
-            section = getattr(self, option.name)
-            if hasattr(section, "check"):
-                section.check()
-        check_training_layouts("num_envs", self.environment.num_envs)
-        _ = self.training_environment  # checks its options
+        check_at_least(1, num_envs=self.num_envs, eval_episodes=self.eval_episodes, log_every=self.log_every)
+        check_at_least(1, checkpoint_every=self.checkpoint_every)
+        check_at_least(0, eval_every=self.eval_every, video_every=self.video_every)
+        if self.substeps is not None:
+            check_at_least(1, substeps=self.substeps)
+        check_positive(dt=self.dt)
+        check_training_seeds("num_envs", self.num_envs)
+        self.for_training()  # checks its options
+
+
+Config = TypeVar("Config", bound=RunConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StagedConfig(RunConfig):
-    """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
+    """A run that trains several stages with action grids of increasing resolution.
+
+    Options with a value for each stage are listed coarsest first; the last value holds for all further stages.
+    """
 
     steps: int
     """Environment steps of all stages together, including those that start_from replaces."""
-    handover: tuple[int, ...]
-    """Environment steps at which the next stage begins, one number for each stage but the last."""
+    handover: tuple[float, ...]
+    """Share of the steps at which the next stage begins, for each stage but the last."""
     resolutions: tuple[int, ...]
     """Action grid R of each stage."""
-    gate_bias: tuple[float, ...]
+    gate_bias: tuple[float, ...] = (-3.0,)
     """Bias of the gate logit of each stage but the first."""
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-
+    interpolation: Interpolation = "half_pixel"
+    """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
+    split: bool = False
+    """Separate narrow encoders for observation and action."""
+    gate_scale: float = 1.0
+    """Largest gate value (the reference: 0.25 with split encoders)."""
+    encoder: EncoderKind = "paper"
+    """full (the paper's), or lean (half the size and width; actions join its features)."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
-    per_stage: ClassVar[tuple[str, ...]] = ()
-    """Options with one value for each stage."""
-    per_residual_stage: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
-    """Options with one value for each stage but the first."""
 
     @property
     def update_every(self) -> int:
         """Environment steps from one update to the next."""
-        return self.environment.num_envs
+        return self.num_envs
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
-        return (*self.handover, self.steps)
+        return (*(round(share * self.steps) for share in self.handover[: len(self.resolutions) - 1]), self.steps)
 
     def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
@@ -175,44 +238,32 @@ class StagedConfig(RunConfig):
         """Structure of the actor of a stage, including all coarser ones."""
         return ActorSpec(
             resolutions=self.resolutions[:stage],
-            gate_bias=self.gate_bias[: stage - 1],
-            split=self.network.split,
-            gate_scale=self.network.gate_scale,
-            interpolation=self.network.interpolation,
-            patch=None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
-            encoder=self.network.encoder,
+            gate_bias=tuple(of_stage(self.gate_bias, residual) for residual in range(1, stage)),
+            split=self.split,
+            gate_scale=self.gate_scale,
+            interpolation=self.interpolation,
+            patch=None if self.interpolation == "aligned" else make_spec(self.task).patch,
+            encoder=self.encoder,
         )
-
-    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """Scale the handovers with the steps; other numbers of stages are equally long, and repeat the last values."""
-        assert isinstance(base, StagedConfig)
-        check_at_least(1, steps=self.steps)
-        stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
-        for name, count in self._counts().items():
-            values: tuple[float, ...] = getattr(base, name)
-            changes[name] = (*values, *values[-1:] * count)[:count]
-        if stages == len(base.resolutions):
-            changes["handover"] = tuple(round(step * scale) for step in base.handover)
-        else:
-            changes["handover"] = tuple(round(self.steps * stage / stages) for stage in range(1, stages))
-        return replace(self, **{name: value for name, value in changes.items() if name not in given})
-
-    def ineffective(self) -> dict[str, str]:
-        """Options without effect under the others: a single stage has no gate."""
-        single = {"network.gate_scale": "several resolutions"} if len(self.resolutions) == 1 else {}
-        small = {"network.split": "encoder paper"} if self.network.encoder == "small" else {}
-        return super().ineffective() | single | small
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
         if max(self.resolutions, default=0) > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions must be at most {patch} in {self.task}, got {self.resolutions}")
+        for option in dataclasses.fields(self):
+            if option.name != "handover" and getattr(self, option.name) == ():
+                raise ConfigError(f"{option.name} must have at least one value")
         self.actor_spec(len(self.resolutions))  # checks the resolutions
         check_at_least(1, steps=self.steps)
-        for name, count in self._counts().items():
-            if (found := len(getattr(self, name))) != count:
-                raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
+        check_positive(gate_scale=self.gate_scale)
+        if len(self.handover) < (count := len(self.resolutions) - 1):
+            raise ConfigError(
+                f"handover must have {count} values for resolutions {self.resolutions}, got {self.handover}"
+            )
+        for share in self.handover:
+            if not 0 < share < 1:
+                raise ConfigError(f"handover must be shares of the steps between 0 and 1, got {self.handover}")
         lengths = tuple(end - start for start, end in pairwise((0, *self.ends())))
         if min(lengths) < (least := self.update_every):
             raise ConfigError(
@@ -220,105 +271,260 @@ class StagedConfig(RunConfig):
                 f"{', '.join(map(str, lengths))} steps"
             )
 
-    def _counts(self) -> dict[str, int]:
-        """Number of values of each option that has one for each stage or residual stage."""
-        stages = len(self.resolutions)
-        return dict.fromkeys(self.per_stage, stages) | dict.fromkeys(self.per_residual_stage, stages - 1)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CoarseToFineConfig(StagedConfig):
-    """A run of the coarse-to-fine policy with either learner; `cfp.preset` supplies the values for a task."""
+    """A run of the coarse-to-fine policy, which may begin with a trained one."""
 
-    learner: Learner
-    """analytic: learns by exact gradients of the simulation; sac: from rewards alone, as in the paper."""
     start_from: str | None = None
     """Policy of the first stages (a run folder, policy.safetensors, the name of one that comes with the package, or
     hf://OWNER/NAME): training begins with the stage after it."""
     refine: bool = False
     """Continue to train the last stage of start_from instead."""
 
-    own_learner: ClassVar[Learner]
-    """The learner that these are the options of."""
-
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        if self.learner != self.own_learner:
-            raise ConfigError(f"learner must be {self.own_learner} for algo {self.algo}, got {self.learner}")
         if self.refine and self.start_from is None:
             raise ConfigError("refine requires start_from, which names the policy")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(CoarseToFineConfig):
+class LearningConfig:
+    """Hyperparameters of soft actor-critic that are the same in every stage."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for actor and critics."""
+    actor_rate: float | None = None
+    """Adam's step size for the actor alone; None: the same as for the critics."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Polyak factor of the target critics."""
+    batch_size: int = 256
+    """Transitions in an update."""
+    buffer_size: int = 200_000
+    """Transitions in the replay buffer."""
+    gradient_steps: int = 1
+    """Updates after each batched step of num_envs robots."""
+    update_start: int = 256
+    """Updates begin when more transitions than this are stored."""
+    reward_momentum: float = 0.99
+    """Momentum of the running mean and variance of the rewards."""
+    max_grad_norm: float = 10.0
+    """Largest gradient norm of each parameter tensor."""
+    n_steps: int = 1
+    """Steps whose rewards a critic's target sums up."""
+    final_rate: float = 1.0
+    """Fraction of the learning rates at the end of a stage; they fall linearly."""
+    weight_average: float = 0.0
+    """Decay of the average of the actor's weights over updates, which is the policy; 0: the actor itself."""
+
+    def common_hyperparameters(self) -> dict[str, Any]:
+        """These options alone, by name."""
+        return {option.name: getattr(self, option.name) for option in dataclasses.fields(LearningConfig)}
+
+    def check_learning(self) -> None:
+        """Raise a `ConfigError` for values out of range."""
+        check_at_least(2, batch_size=self.batch_size)  # rewards are divided by their deviation in the batch
+        check_at_least(1, buffer_size=self.buffer_size, gradient_steps=self.gradient_steps, n_steps=self.n_steps)
+        check_at_least(1, update_start=self.update_start)
+        if self.buffer_size < self.batch_size:
+            raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
+        if self.n_steps > 1 and self.gamma == 1:
+            raise ConfigError("gamma must be below 1 with several n_steps, got 1")
+        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
+        check_decay(weight_average=self.weight_average)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        if self.actor_rate is not None:
+            check_positive(actor_rate=self.actor_rate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hyperparameters(LearningConfig):
+    """All hyperparameters of one stage of soft actor-critic: those of `LearningConfig` and those of the stage."""
+
+    alpha: float = 0.01
+    """Entropy temperature."""
+    gate_penalty: float = 0.0
+    """Weight rho of the gate penalty ``mean ||g||_2 / R`` in the actor loss of a residual actor."""
+    random_steps: int = 500
+    """Environment steps with uniformly random actions at the start."""
+    actor_start: int = 0
+    """Environment steps before the first actor update; until then only the critics learn."""
+    noise_cells: int = 0
+    """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
+    noise_scale: tuple[float, float] = (0.05, 0.4)
+    """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
+
+    def check(self) -> None:
+        """Raise a `ConfigError` for values out of range."""
+        self.check_learning()
+        check_at_least(0, alpha=self.alpha, gate_penalty=self.gate_penalty)
+        check_at_least(0, random_steps=self.random_steps, actor_start=self.actor_start)
+        if self.noise_cells not in (allowed := (0, 1, 2, *RESOLUTIONS)):
+            raise ConfigError(f"noise_cells must be one of {allowed}, got {self.noise_cells}")
+        check_positive(noise_scale=min(self.noise_scale))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(LearningConfig, CoarseToFineConfig):
     """A run of the coarse-to-fine policy that learns from rewards alone, by soft actor-critic."""
 
-    learner: Learner = "sac"
+    algo: str = "cfp-sac"
+    """Name of the algorithm."""
     random_steps: tuple[int, ...]
     """Uniformly random environment steps at the start of each stage (none where a policy is refined)."""
     alpha: tuple[float, ...]
     """Entropy temperature of each stage."""
     gate_penalty: tuple[float, ...]
     """Weight of the gate penalty, for each stage but the first."""
-    critics_first: float = 0.0
-    """Fraction of every stage but the first in which only the critics learn, if that is more than actor_start."""
+    critics_first: tuple[float, ...] = (0.0,)
+    """Share of each stage in which only the critics learn."""
+    noise_cells: int = 0
+    """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
+    noise_scale: tuple[float, float] = (0.05, 0.4)
+    """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
     max_episode_steps: int | None = None
     """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
     different ages. None: the horizon, and all begin together."""
-    learning: LearningConfig = field(default_factory=LearningConfig)
-
-    own_learner: ClassVar[Learner] = "sac"
-    per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
-    per_residual_stage: ClassVar[tuple[str, ...]] = (*StagedConfig.per_residual_stage, "gate_penalty")
-
-    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """Scale the start of the actor's updates, too, if there are fewer steps."""
-        config = super().with_derived(base, given)
-        assert isinstance(config, SACConfig) and isinstance(base, SACConfig)
-        return replace(config, learning=scale_start(self.learning, base.learning, self.steps / base.steps, given))
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
-        own = dict(vars(self.learning))
-        if stage > 1:
-            own["actor_start"] = max(own["actor_start"], round(self.critics_first * self.stage_steps(stage)))
         return Hyperparameters(
-            **own,
-            alpha=self.alpha[stage - 1],
-            gate_penalty=self.gate_penalty[stage - 2] if stage > 1 else 0.0,
-            random_steps=self.random_steps[stage - 1],
+            **self.common_hyperparameters(),
+            noise_cells=self.noise_cells,
+            noise_scale=self.noise_scale,
+            alpha=of_stage(self.alpha, stage),
+            gate_penalty=of_stage(self.gate_penalty, stage - 1) if stage > 1 else 0.0,
+            random_steps=of_stage(self.random_steps, stage),
+            actor_start=round(of_stage(self.critics_first, stage) * self.stage_steps(stage)),
         )
-
-    def ineffective(self) -> dict[str, str]:
-        """Options that require a policy to refine, or noise on cells."""
-        anchor = {} if self.refine else {"learning.anchor": "refine"}
-        noise = {} if self.learning.noise_cells else {"learning.noise_scale": "noise_cells"}
-        single = {"critics_first": "several resolutions"} if len(self.resolutions) == 1 else {}
-        return super().ineffective() | anchor | noise | single
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        for name in ("random_steps", "alpha", "gate_penalty"):
-            check_at_least(0, **{name: min(getattr(self, name), default=0)})
-        check_decay(critics_first=self.critics_first)
+        for share in self.critics_first:
+            check_decay(critics_first=share)
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)
-        if (cells := self.learning.noise_cells) > (coarsest := self.resolutions[0]):
+        for stage in range(1, len(self.resolutions) + 1):
+            self.hyperparameters(stage).check()
+        if (cells := self.noise_cells) > (coarsest := self.resolutions[0]):
             raise ConfigError(f"noise_cells must be at most {coarsest}, the coarsest of resolutions, got {cells}")
 
 
-def scale_start(
-    learning: LearningConfig, base: LearningConfig, fraction: float, given: Collection[str]
-) -> LearningConfig:
-    """Start the actor's updates earlier in a run with a ``fraction`` of the steps of the preset ``base``."""
-    if "actor_start" in given or fraction >= 1:
-        return learning
-    return replace(learning, actor_start=round(base.actor_start * fraction))
+@dataclass(frozen=True, kw_only=True)
+class WindowConfig(RunConfig):
+    """Options of learners that differentiate windows of simulation and value their ends by a critic.
+
+    The environment options say where the policy is evaluated; train_particles and train_dt, where it is trained.
+    Evaluations always use the task's own reward.
+    """
+
+    train_particles: Particles = "lite"
+    """Particles of the simulations in training."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: as in the environment."""
+    window: int = 16
+    """Control steps that a gradient reaches back."""
+    gamma: float = 0.98
+    """Discount factor."""
+    learning_rate: float = 1e-3
+    """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
+    td_lambda: float = 0.95
+    """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
+    critic_updates: int = 16
+    """Updates of the critic after each window."""
+    tau: float = 0.4
+    """Rate at which the target critic follows the critic after each window: target = (1 - tau) target + tau critic."""
+    max_grad_norm: float = 1.0
+    """Largest norm of a gradient of the networks, of actor and critic each."""
+    max_episode_steps: int = 400
+    """Control steps after which a training episode is truncated, if the task's horizon is not shorter; the first ones
+    are truncated at staggered ages."""
+    num_layouts: int = 16
+    """Particle layouts that training episodes start from in turn."""
+    reward: Literal["task", "speed"] = "task"
+    """Training reward. task: the task's own, made smooth; speed: 60 per m/s to the right, less the task's cost of
+    action."""
+    split_weight: float = 1000.0
+    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
+    exceeds split_margin."""
+    split_margin: float = 0.85
+    """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
+    integrity_weight: float = 300.0
+    """Weight of the cost of particles that were neighbours at the start of the window, or of the episode within it, and
+    drift apart."""
+    reward_scale: float = 0.05
+    """Factor on the training reward that keeps the critic's values near one."""
+    success_reward: float = 0.0
+    """Reward per step, discounted, as if the episode went on after it ended in success, for 1 / (1 - gamma) steps,
+    at most 100; 0: none, as in the task."""
+
+    def for_training(self: Config) -> Config:
+        """These options, with the environment that is trained in."""
+        assert isinstance(self, WindowConfig)
+        return self.simulated_with(self.train_particles, self.train_dt)
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        check_at_least(1, window=self.window, critic_updates=self.critic_updates)
+        check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
+        check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
+        check_at_least(0, integrity_weight=self.integrity_weight, success_reward=self.success_reward)
+        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        check_positive(reward_scale=self.reward_scale)
+        check_training_seeds("num_layouts", self.num_layouts, self.num_envs)
 
 
-def check_training_layouts(name: str, count: int, before: int = 0, stages: int = 1) -> None:
+@dataclass(frozen=True, kw_only=True)
+class AnalyticConfig(CoarseToFineConfig, WindowConfig):
+    """A run of the coarse-to-fine policy that learns by gradients through the simulation."""
+
+    algo: str = "cfp-analytic"
+    """Name of the algorithm."""
+    action_step: tuple[float, ...]
+    """Root mean square of each step on the actions of a window, for each stage."""
+    final_step: float = 0.4
+    """Fraction of action_step at the end of a stage; it falls linearly."""
+    minibatches: int = 16
+    """Steps of the regression after each window."""
+    minibatch_size: int = 64
+    """Images in a step of the regression."""
+    windows_kept: int = 4
+    """Latest windows that the regression draws from."""
+    weight_average: float = 0.95
+    """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
+    warmup: int = 15
+    """Windows at the beginning of a stage that starts from a trained policy, in which only the critic learns."""
+    displacement: bool = True
+    """The critic sees the robot's displacement since the reset."""
+
+    @property
+    def update_every(self) -> int:
+        """Environment steps from one update to the next: a window of all robots."""
+        return self.window * self.num_envs
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        check_at_least(0, warmup=self.warmup)
+        check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
+        check_at_least(1, windows_kept=self.windows_kept)
+        check_fraction(final_step=self.final_step)
+        check_decay(weight_average=self.weight_average)
+        check_positive(action_step=min(self.action_step))
+
+
+def of_stage(values: tuple[Options, ...], stage: int) -> Options:
+    """Value of a stage, counted from 1; the last one holds for all further stages."""
+    return values[min(stage, len(values)) - 1]
+
+
+def check_training_seeds(name: str, count: int, before: int = 0, stages: int = 1) -> None:
     """Check that none of the initial positions of training belongs to evaluations.
 
     Args:
@@ -343,3 +549,38 @@ def check_task(task: object) -> None:
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
+
+
+def update_from_dict(base: Options, values: Any) -> Options:
+    """Replace fields of a dataclass by JSON values, whose types are checked; lists become tuples.
+
+    Raises:
+        ConfigError: There is no such field, or a value is of another type.
+    """
+    assert dataclasses.is_dataclass(base) and not isinstance(base, type)
+    if not isinstance(values, dict):
+        raise ConfigError(f"the options must be an object, got {brief(values)}")
+    hints = typing.get_type_hints(type(base))
+    names = [option.name for option in dataclasses.fields(base)]
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in names:
+            raise ConfigError(f"{name} is not an option; options are {', '.join(names)}")
+        value = tuple(value) if isinstance(value, list) else value
+        try:
+            if isinstance(value, bool) and hints[name] is not bool:  # which Python takes for a number
+                raise TypeCheckError("is a truth value")
+            check_type(value, hints[name])
+        except TypeCheckError as error:
+            expected = getattr(hints[name], "__name__", str(hints[name]).replace("typing.", ""))
+            raise ConfigError(f"{name} must be of type {expected}, got {brief(value)}") from error
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"{name} must be below 2**63, got a number of {len(str(value))} digits")
+        changes[name] = float(value) if hints[name] is float and isinstance(value, int) else value
+    return replace(base, **changes)
+
+
+def differences(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Options that differ: the value in each; None where there is none."""
+    names = {**first, **second}
+    return {name: (first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)}

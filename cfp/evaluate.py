@@ -12,19 +12,16 @@ from typing import Literal
 
 import tyro
 
-from cfp.config import RunConfig
+from cfp import registry
+from cfp.config import Particles, RunConfig, StagedConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.returns import Noise, compare, evaluation_seed, format_table, to_rows, without_noise
 from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config
-from cfp.experiment.training import Program
 from cfp.files import check_output
-from cfp.from_dict import update_from_dict
-from cfp.policy import Policy, is_of_another_task, policy_file, shipped
-from cfp.sections import Particles
-from cfp.train import PROGRAM
+from cfp.policy import Policy, environment_of, is_of_another_task, policy_file, shipped
 from cfp.validation import check_at_least
 from dittogym.trajectories import Episode, save_episodes
 from dittogym.trajectories.episode import record_batch
@@ -54,21 +51,21 @@ class Selection:
     device: str = "auto"
     """cpu, cuda, or auto."""
 
-    def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
+    def open(self) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
         if self.folder is not None and self.policy is None:
             if not self.folder.exists() and str(self.folder) in shipped():
                 raise ConfigError(f"{self.folder}: there is no such folder; --policy {self.folder} names the policy")
-            config, policies = open_run(program, self.folder, self.device, self.seed)
+            config, policies = open_run(self.folder, self.device, self.seed)
         elif self.policy is not None and self.folder is None:
-            config, policies = open_policy(program, self.policy, self.device, self.seed)
+            config, policies = open_policy(self.policy, self.device, self.seed)
         else:
             given = "neither" if self.policy is None else "both"
             raise ConfigError(f"either policy or a folder must be given, got {given}")
-        if self.particles is not None and self.particles != config.environment.particles:
-            config = replace(config, environment=config.environment.for_evaluation(self.particles))
+        if self.particles is not None and self.particles != config.particles:
+            config = replace(config, particles=self.particles)
         if self.dt is not None:
-            config = replace(config, environment=config.environment.with_dt(self.dt))
+            config = config.simulated_with(dt=self.dt)
         config.check()
         if any(is_of_another_task(policy.description, config) for policy in policies.values()):
             print(f"a file of task {config.task!r} has changed since the policy was trained", file=sys.stderr)
@@ -114,11 +111,9 @@ class Command(Selection):
     film: tyro.conf.OmitArgPrefixes[FilmOptions] = field(default_factory=FilmOptions)
 
 
-def open_run(
-    program: Program, folder: Path, device: str, seed: int | None = None
-) -> tuple[RunConfig, dict[str, Policy]]:
+def open_run(folder: Path, device: str, seed: int | None = None) -> tuple[RunConfig, dict[str, Policy]]:
     """Options of the run in a folder, for evaluation, and its policies by stage, the newest last."""
-    config = replace(read_config(folder, program.configure), device=device)
+    config = replace(read_config(folder, registry.configure), device=device)
     if seed is not None:
         config = replace(config, seed=seed)
         config.check()
@@ -126,7 +121,7 @@ def open_run(
     if not files:
         raise CheckpointError(f"{folder}: no policy has been written yet")
     loaded = choose_device(device)
-    policies = {name: program.load(path, loaded) for name, path in files.items()}
+    policies = {name: registry.load(path, loaded) for name, path in files.items()}
     for name, path in files.items():
         about, stages = policies[name].description, len(config.ends())
         if about["stage"] > stages:
@@ -138,24 +133,23 @@ def open_run(
     return config, policies
 
 
-def open_policy(program: Program, path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
+def open_policy(path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
     """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
     file = policy_file(path)
-    policy = program.load(file, choose_device(device))
+    policy = registry.load(file, choose_device(device))
     about = policy.description
-    base = program.configure({"algo": about["kind"], "task": about["task"]})
-    network = about["network"] if isinstance(about.get("network"), dict) else {}
-    # in a custom task, the stages of the preset may not fit the networks
-    stages = {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
-    # Stages must be long enough for the number of robots that they are trained with, which does not matter here.
-    environment = {**about["environment"], "num_envs": base.environment.num_envs}
-    config = update_from_dict(base, {"environment": environment, **stages}).with_derived(base, stages)
-    config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
+    base = registry.configure({"algo": registry.algo_of(about), "task": about["task"]})
+    # The number of robots that it was trained with does not matter here.
+    values = vars(environment_of(about)) | {"num_envs": base.num_envs, "device": device}
+    if isinstance(base, StagedConfig):  # in a custom task, the stages of the preset may not fit the networks
+        grids = tuple(about["network"]["resolutions"])
+        values |= {"resolutions": grids, "handover": tuple(stage / len(grids) for stage in range(1, len(grids)))}
+    config = replace(base, **values, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {file.stem: policy}
 
 
-def run(program: Program, command: Command) -> str:
+def run(command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
     check_at_least(1, episodes=command.episodes)
     files, usual = {"video": command.video, "replay": command.replay}, vars(FilmOptions())
@@ -163,7 +157,7 @@ def run(program: Program, command: Command) -> str:
     check_files(files, options)
     if command.record is not None and command.record.suffix != ".npz":
         raise ConfigError(f"record must end in .npz, got {command.record}")
-    config, policies = command.open(program)
+    config, policies = command.open()
     for name, path in {**files, "record": command.record}.items():
         if path is not None:
             check_output(name, path)
@@ -184,10 +178,9 @@ def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode
     return [record_episode(config, policy, deterministic, seed, recorder) for seed in seeds]
 
 
-def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
+def main(arguments: Sequence[str] | None = None, module: str = "cfp.evaluate") -> int:
     """Command line entry; returns the exit code."""
-    module = f"{program.package}.evaluate"
-    return run_command(lambda: print(run(program, read_command(Command, module, EXAMPLES, arguments))))
+    return run_command(lambda: print(run(read_command(Command, module, EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

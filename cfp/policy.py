@@ -24,12 +24,10 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
-from cfp.config import LARGEST_SEED, RunConfig
+from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import write_atomically, write_json
-from cfp.from_dict import type_name, update_from_dict
 from cfp.hub import SCHEME, Shareable, download
-from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from cfp.validation import brief
 from dittogym import make_spec
 from dittogym.action import trained_indexing
@@ -231,7 +229,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
             f"{policy_file(path)}: kind must be {KIND!r}, got {description['kind']!r}; see baselines.load"
         )
     with report_mismatch(path):
-        spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
+        spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"])
         policy = ActorPolicy(spec, description["deterministic"])
         policy.actor.load_state_dict(tensors)
     policy.description = description
@@ -303,7 +301,7 @@ def _check_description(description: Any) -> None:
             if type(value) is not int or value not in allowed:  # isinstance would accept a bool
                 raise ConfigError(f"{name} must be between {allowed[0]} and {allowed[-1]}, got {value!r}")
         elif not isinstance(value, allowed):
-            raise ConfigError(f"{name} must be {type_name(allowed)}, got {value!r}")
+            raise ConfigError(f"{name} must be of type {allowed.__name__}, got {value!r}")
     environment = description["environment"]
     faulty = environment.pop("parity", "clean") == "reference"  # trained with faults of the reference, which are gone
     if environment.get("action_layout") is None:
@@ -313,7 +311,7 @@ def _check_description(description: Any) -> None:
 
 def environment_of(description: Mapping[str, Any]) -> EnvironmentConfig:
     """The environment in which the policy with a description was trained."""
-    return update_from_dict(EnvironmentConfig(), description["environment"], "environment")
+    return update_from_dict(EnvironmentConfig(), description["environment"])
 
 
 def _translated(description: dict[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
@@ -369,14 +367,14 @@ def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[s
         "stage": stage,
         "steps": steps,
         "seed": config.seed,
-        "deterministic": config.report.eval_deterministic,
+        "deterministic": config.eval_deterministic,
         "environment": dataclasses.asdict(config.environment),
     } | _contents(config)
 
 
 def _contents(config: RunConfig) -> dict[str, str]:
     """SHA-256 of the files that the task's options name: that of a custom task, and a chosen target picture."""
-    target = Path(config.environment.target or "")
+    target = Path(config.target or "")
     picture = hashlib.sha256(target.read_bytes()).hexdigest() if target.is_file() else None
     files = {"task_file": fingerprint(config.task), "target_picture": picture}
     return {name: value for name, value in files.items() if value is not None}
@@ -391,7 +389,7 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     """Load the policy that a run starts from, which must be for its task, physics and orientation of actions."""
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    if (found := trained_indexing(policy)) != (expected := config.environment.action_indexing):
+    if (found := trained_indexing(policy)) != (expected := config.action_layout):
         raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
 

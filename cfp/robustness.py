@@ -19,12 +19,10 @@ from cfp.evaluate import Selection
 from cfp.evaluation.page import write_figure
 from cfp.evaluation.returns import Result, Trial, decision_grid, evaluate, evaluation_seed, numbers
 from cfp.experiment.cli import read_command, run_command
-from cfp.experiment.folder import Folder, make_folder
-from cfp.experiment.training import Program
+from cfp.experiment.folder import Folder
 from cfp.files import write_json, write_text
 from cfp.policy import Policy
 from cfp.tables import Column, Table
-from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
 
@@ -137,8 +135,7 @@ def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
 def make_table(name: str, config: RunConfig, rows: Sequence[dict[str, Any]]) -> Table:
     """The table of the report about the policy ``name``."""
     description = (
-        f"Mean return of {rows[0]['episodes']} episodes, particles {config.environment.particles}, "
-        "and ratio to the unperturbed."
+        f"Mean return of {rows[0]['episodes']} episodes, particles {config.particles}, and ratio to the unperturbed."
     )
     if rows[0]["ratio"] is None:
         description += " The unperturbed return is not positive, so that there are no ratios to it."
@@ -162,15 +159,15 @@ def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
     return figure
 
 
-def run(program: Program, command: Command) -> str:
+def run(command: Command) -> str:
     """Evaluate all cases, write the files, and return the table."""
     command.check()
     cases = make_cases(command.dropout, command.action_noise, command.latency, command.shift, command.friction)
-    config, policies = command.open(program)
+    config, policies = command.open()
     policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None
     cases = choose(cases, command.cases, config.make_spec(), policy)
-    make_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
     table = make_table(command.policy or config.name, config, rows)
@@ -181,10 +178,9 @@ def run(program: Program, command: Command) -> str:
     return f"{table.to_markdown()}\n\nbar plot: {path.with_suffix('.png')}"
 
 
-def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
+def main(arguments: Sequence[str] | None = None, module: str = "cfp.robustness") -> int:
     """Command line entry; returns the exit code."""
-    module = f"{program.package}.robustness"
-    return run_command(lambda: print(run(program, read_command(Command, module, EXAMPLES, arguments))))
+    return run_command(lambda: print(run(read_command(Command, module, EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

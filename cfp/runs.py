@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
+from cfp import registry
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.video import record_policy
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.experiment.process import Stopped, keep_memory
-from cfp.experiment.training import Program, from_python, train
+from cfp.experiment.training import from_python, train
 from cfp.files import parse_json
 from cfp.hub import Shareable
 from cfp.policy import Policy
 from cfp.tables import read_table
-from cfp.train import PROGRAM
 from dittogym.render.recording import Recording, check_film_options
 
 
@@ -33,31 +33,14 @@ class Run:
         ConfigError: It cannot be the path of a folder.
     """
 
-    program: ClassVar[Program] = PROGRAM
-
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = _folder("folder", folder)
-        self.config: RunConfig = read_config(self.folder, self.program.configure)
-
-    @classmethod
-    def fit(cls, options: dict[str, Any], out: str | os.PathLike[str] | None, resume: bool) -> Run:
-        """Train with these ``options``, into the folder ``out``; see `cfp.fit`."""
-        folder = None if out is None else _folder("out", out)
-        if not isinstance(resume, bool):
-            raise ConfigError(f"resume must be True or False, got {resume!r}")
-        command = from_python(cls.program, options, folder, resume)
-        keep_memory()
-        try:
-            train(cls.program, command, "the same call with resume=True continues the run")
-        except Stopped as stopped:
-            raise KeyboardInterrupt(str(stopped)) from None
-        assert command.out is not None
-        return cls(command.out)
+        self.config: RunConfig = read_config(self.folder, registry.configure)
 
     @cached_property
     def policy(self) -> Policy:
         """The policy of the last stage, that with its best evaluation; read at the first access."""
-        return self.program.load(policy_path(self.folder), choose_device(self.config.device))
+        return registry.load(policy_path(self.folder), choose_device(self.config.device))
 
     @property
     def evaluations(self) -> list[dict[str, float | None]]:
@@ -123,7 +106,7 @@ def fit(
     resume: bool = False,
     **options: Any,
 ) -> Run:
-    """Train the coarse-to-fine policy, as ``python -m cfp.train`` does, with the same folder of the run.
+    """Train a policy, as ``torchmpm train`` does, with the same folder of the run.
 
     Ctrl-C writes a checkpoint and raises `KeyboardInterrupt`; the same call with ``resume=True`` continues. On Linux
     glibc keeps freed memory from then on, which makes updates of the networks a third faster.
@@ -134,7 +117,7 @@ def fit(
         out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
         resume: Continue the run in the folder.
         options: Options of the command line with underscores, such as ``seed=1``, ``particles=500``,
-            ``handover=(3200,)`` or ``video=False``.
+            ``handover=(0.5,)`` or ``video=False``.
 
     Returns:
         The finished run.
@@ -147,4 +130,13 @@ def fit(
     """
     if steps is not None:
         options["steps"] = steps
-    return Run.fit({"task": task, **options}, out, resume)
+    if not isinstance(resume, bool):
+        raise ConfigError(f"resume must be True or False, got {resume!r}")
+    command = from_python({"task": task, **options}, None if out is None else _folder("out", out), resume)
+    keep_memory()
+    try:
+        train(command, "the same call with resume=True continues the run")
+    except Stopped as stopped:
+        raise KeyboardInterrupt(str(stopped)) from None
+    assert command.out is not None
+    return Run(command.out)

@@ -1,9 +1,11 @@
-"""Options of algorithms that act on one grid."""
+"""Options of algorithms that act on one grid, and of those that simulate more cheaply than they are evaluated."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-from cfp.config import RESAMPLE_NEEDS_SAC, RunConfig
+from cfp.config import Config, Particles, RunConfig
 from cfp.errors import ConfigError
 from dittogym import make_spec
 from dittogym.arguments import find_resolution
@@ -20,7 +22,15 @@ def find_grid(option: str, task: str, grid: Grid) -> int:
         raise ConfigError(str(error)) from error
 
 
-@dataclass(frozen=True)
+def long_dt(task: str) -> float | None:
+    """Duration of a substep, s, for gradient methods and planners; None: as in the environment.
+
+    Twice the usual one where that changes no more than another layout of particles does (benchmarks/long_substeps.py).
+    """
+    return 2e-4 if task == "run" else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class GridConfig(RunConfig):
     """Options of a run on one action grid."""
 
@@ -37,6 +47,17 @@ class GridConfig(RunConfig):
         for stage in range(1, len(self.ends()) + 1):
             self.resolution(stage)
 
-    def ineffective(self) -> dict[str, str]:
-        """Layouts are counted from the seed."""
-        return super().ineffective() | RESAMPLE_NEEDS_SAC
+
+@dataclass(frozen=True, kw_only=True)
+class OptimisationConfig(GridConfig):
+    """A run that optimises actions in simulations with fewer particles or longer substeps than it is evaluated with."""
+
+    train_particles: Particles | None = None
+    """Particles of the simulations in training, at most the environment's; None: as many."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: as in the environment."""
+
+    def for_training(self: Config) -> Config:
+        """These options, with the environment in which actions are optimised."""
+        assert isinstance(self, OptimisationConfig)
+        return self.simulated_with(self.train_particles, self.train_dt)

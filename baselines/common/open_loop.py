@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from cfp.experiment.algorithm import Algorithm
 from cfp.hub import Shareable
+from cfp.learner import Learner, Scalars
 from cfp.policy import Memory, Observation, Start, read_policy, report_mismatch, write_policy
 
 
@@ -75,15 +78,59 @@ class OpenLoop(Shareable):
             return cls(tensors["actions"], description)
 
 
-class OpenLoopAlgorithm(Algorithm):
-    """An algorithm whose policy is a sequence of actions."""
+class OpenLoopLearner(Learner):
+    """A planner or an optimiser of actions; its policy is a sequence of actions, and no network is trained."""
+
+    finished: bool = False  # whether the episode is over before the last step
+
+    @property
+    def trained_policy(self) -> OpenLoop:
+        """The sequence so far."""
+        raise NotImplementedError
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the stage that is done, 0 to 1."""
+        return min(self.num_timesteps / self.config.stage_steps(self.stage), 1.0)
+
+    def update(self) -> Scalars:
+        """Take some environment steps, add them to `num_timesteps`, and return scalars to log."""
+        raise NotImplementedError
+
+    @property
+    def logger(self) -> Logger:
+        """Where scalars go."""
+        return self._logger
+
+    def set_logger(self, logger: Logger) -> None:
+        """Set where scalars go."""
+        self._logger = logger
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: BaseCallback,
+        log_interval: int | None = None,
+        *,
+        reset_num_timesteps: bool = True,
+    ) -> None:
+        """Take at least ``total_timesteps`` more environment steps, with the callbacks of stable-baselines3."""
+        callback.init_callback(cast(BaseAlgorithm, self))
+        callback.on_training_start(locals(), globals())
+        end = self.num_timesteps + total_timesteps
+        while self.num_timesteps < end and not self.finished:
+            callback.on_rollout_start()
+            for name, value in self.update().items():
+                self.logger.record(name, value)
+            callback.on_step()
+        callback.on_training_end()
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actions; those made for one layout name it."""
-        policy = cast(OpenLoop, self.policy)
+        policy = self.trained_policy
         OpenLoop(policy.actions, description | policy.description).save(path)
 
     @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> OpenLoop:
+    def load_policy(cls, path: Path, device: str = "cpu") -> OpenLoop:
         """Load actions."""
         return OpenLoop.load(path)

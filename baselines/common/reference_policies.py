@@ -1,7 +1,7 @@
 """Reference policies: zero actions, random actions and a travelling wave. Nothing is learned."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,12 +12,11 @@ from baselines.common.open_loop import OpenLoop
 from cfp.evaluation.returns import UntrainedPolicy
 from cfp.policy import Policy
 from cfp.presets import sac_preset
-from cfp.sections import ReportConfig
 from dittogym import make_spec
 from dittogym.action import ActionIndexing, from_grid_indexing
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReferenceConfig(GridConfig):
     """Options of the evaluation of a reference policy."""
 
@@ -25,25 +24,16 @@ class ReferenceConfig(GridConfig):
         """One stage, without learning."""
         return (1,)
 
-    def ineffective(self) -> dict[str, str]:
-        """Nothing is learned side by side."""
-        return super().ineffective() | {"environment.num_envs": "algorithms that learn"}
-
 
 def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
     """Default options: ``quick`` evaluates with few particles, ``paper`` in the paper's environment."""
     base = sac_preset(task, name)
-    return ReferenceConfig(
-        algo=algo,
-        task=task,
-        preset=base.preset,
-        environment=replace(base.environment, num_envs=1),
-        report=ReportConfig(eval_every=1, checkpoint_every=1, log_every=1),
-    )
+    own = {"algo": algo, "task": task, "preset": base.preset, "eval_every": 1, "checkpoint_every": 1, "log_every": 1}
+    return ReferenceConfig(**(vars(base.environment) | own | {"num_envs": 1}))
 
 
 def _scripted(config: ReferenceConfig) -> OpenLoop:
-    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.environment.action_indexing))
+    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.action_layout))
 
 
 REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {

@@ -1,16 +1,15 @@
 """Options of a distillation."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from baselines.common.grid import Grid, find_grid
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.config import RESAMPLE_NEEDS_SAC, StagedConfig, check_training_layouts
-from cfp.sections import EnvironmentConfig, Particles
+from cfp.config import Config, Particles, StagedConfig, check_training_seeds
 from cfp.validation import check_at_least, check_fraction, check_positive
 
 
-@dataclass(frozen=True)
-class DistillConfig(StagedConfig):
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig(GradientPlannerConfig, StagedConfig):
     """A distillation; num_envs robots move side by side. Stages are listed coarsest first.
 
     The environment options say where the student is evaluated; train_particles, where it is taught.
@@ -47,14 +46,13 @@ class DistillConfig(StagedConfig):
     """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
     num_layouts: int = 64
     """Particle layouts that training episodes start from in turn."""
-    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
     planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
 
-    @property
-    def training_environment(self) -> EnvironmentConfig:
-        """Options of the simulations in training."""
-        return self.environment.with_particles(self.train_particles)
+    def for_training(self: Config) -> Config:
+        """These options, with the environment that the student is taught in."""
+        assert isinstance(self, DistillConfig)
+        return self.simulated_with(self.train_particles)
 
     @property
     def planner_resolution(self) -> int:
@@ -64,20 +62,16 @@ class DistillConfig(StagedConfig):
     @property
     def update_every(self) -> int:
         """Environment steps from one update to the next: a round of all robots."""
-        return self.rollout_steps * self.environment.num_envs
-
-    def ineffective(self) -> dict[str, str]:
-        """Options of the planner have no effect with other teachers; layouts are counted from the seed."""
-        planner = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().ineffective() | planner | RESAMPLE_NEEDS_SAC
+        return self.rollout_steps * self.num_envs
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        self.check_planner()
         _ = self.planner_resolution  # checks planner_grid
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
-        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs, len(self.resolutions))
+        check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
         check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
         check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)

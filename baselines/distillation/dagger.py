@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from baselines.distillation.teachers import Teacher, project
-from cfp.analytic.episodes import Episodes
-from cfp.analytic.stateful import Stateful, compress, decompress
+from cfp.analytic.window import Episodes
 from cfp.envs import disturbances
+from cfp.learner import Resumable, compress, decompress
 from dittogym import TorchEnv
 from torchmpm import tree
 
@@ -75,7 +75,7 @@ def drop_entries(values: Tensor, probability: float, grid: int | None = None) ->
     return disturbances.drop(values, mask.to(values.device))
 
 
-class Collector(Stateful):
+class Collector(Resumable):
     """Lets a mixture of student and teacher act, and labels the states by the teacher.
 
     Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
@@ -95,8 +95,14 @@ class Collector(Stateful):
         self.restarted = self.teacher_acts.clone()  # a new episode began since the teacher's plan was made
 
     @torch.no_grad()
-    def collect(self, steps: int, beta: float, student: Callable[[Tensor], Tensor]) -> Labels:
-        """Act for some control steps and return the labels.
+    def collect(
+        self,
+        steps: int,
+        beta: float,
+        student: Callable[[Tensor], Tensor],
+        after_step: Callable[[Tensor, list[dict[str, Any]]], bool],
+    ) -> Labels | None:
+        """Act for some control steps and return the labels; None if ``after_step`` returns False.
 
         The teacher controls a robot with probability ``beta``, drawn from torch's generator; the student maps images
         (B, 3, 64, 64) to actions (B, 2, R, R), and loses entries of both with probability ``dropout``.
@@ -118,18 +124,21 @@ class Collector(Stateful):
             actions.append(teacher_action[valid].cpu())
             student_action = student(drop_entries(observation, self.dropout))
             student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
-            observation = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
+            observation, done, infos = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
+            if not after_step(done, infos):
+                return None
         return Labels(torch.cat(images), torch.cat(actions))
 
     def _enlarge(self, action: Tensor) -> Tensor:
         return project(action, self.env.action_resolution, self.env.spec.patch)
 
-    def _step(self, action: Tensor) -> Tensor:
-        """Carry out an action, start new episodes where they are over, return the next observation."""
+    def _step(self, action: Tensor) -> tuple[Tensor, Tensor, list[dict[str, Any]]]:
+        """Carry out an action, start new episodes where they are over; the next observation, which, and their infos."""
         observation, reward, terminated, _, info = self.env.step(action)
         done = self.episodes.record(reward, terminated)
+        infos = self.episodes.infos(done)
         if bool(done.any()):
             self.episodes.restart(done, terminated, info["finite"])
             self.restarted = self.restarted | done
             observation = self.env.observation()
-        return observation
+        return observation, done, infos

@@ -15,15 +15,15 @@ from baselines.common.open_loop import OpenLoop
 from baselines.distillation.config import DistillConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import configure, find, load
-from cfp.analytic.stateful import Stateful
+from cfp.config import TASK_OPTIONS, EnvironmentConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import TrainingRun
 from cfp.files import read_json, write_json
 from cfp.hub import is_address
+from cfp.learner import Resumable
 from cfp.policy import Policy, StatePolicy, check_trained_for, copy_policy, read_policy, shipped
-from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import TorchEnv
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing, trained_indexing
 
@@ -31,7 +31,7 @@ from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, 
 TRAINED = ("shac", "gradient")
 
 
-class Teacher(Stateful, ABC):
+class Teacher(Resumable, ABC):
     """Labels the present states of an environment with actions."""
 
     fresh: bool = True
@@ -147,9 +147,8 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> 
     if config.teacher not in TRAINED or teacher_path(folder).exists():
         return
     chosen = configure({"algo": config.teacher, "task": config.task})
-    same = {name: getattr(config.environment, name) for name in ("substeps", "dt", "dtype", "backend", *TASK_OPTIONS)}
-    environment = replace(chosen.environment, **same)
-    chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
+    same = {name: getattr(config, name) for name in ("substeps", "dt", "dtype", "backend", *TASK_OPTIONS)}
+    chosen = replace(chosen, seed=config.seed, device=config.device, **same)
     algorithm, own = find(config.teacher), folder / "teacher"
     run = TrainingRun(algorithm, chosen, own, True, signals)
     print(f"training the teacher first: {config.teacher} -> {own}")

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from baselines.common.rollout import StepFunction, check_differentiable, rollout, soft_step
 from cfp.analytic.reward import split_cost
-from cfp.analytic.stateful import Stateful
 from cfp.errors import ConfigError
+from cfp.learner import Resumable
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.contract import measure
@@ -24,7 +24,7 @@ from torchmpm import tree
 SPLIT_MARGIN = 0.8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
     """Options that all planners have."""
 
@@ -41,7 +41,7 @@ class PlannerConfig:
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
     exceeds 0.8."""
 
-    def check(self) -> None:
+    def check_planner(self) -> None:
         """Check what the types do not express.
 
         Raises:
@@ -56,7 +56,7 @@ class PlannerConfig:
 Config = TypeVar("Config", bound=PlannerConfig)
 
 
-class Planner(Stateful, ABC, Generic[Config]):
+class Planner(Resumable, ABC, Generic[Config]):
     """Plans the next actions of every simulation of an environment, each simulation by itself.
 
     Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
@@ -86,7 +86,7 @@ class Planner(Stateful, ABC, Generic[Config]):
         self, env: TorchEnv, config: Config | None = None, *, step: StepFunction | None = None, seed: int = 0
     ) -> None:
         self.config = config = config or self.config_type()
-        config.check()
+        config.check_planner()
         self.env, self.step = env, step or self.default_step
         if self.step is soft_step:
             check_differentiable(env)

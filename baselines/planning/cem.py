@@ -16,7 +16,7 @@ from dittogym.model import EnvState
 from torchmpm import tree
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CEMPlannerConfig(PlannerConfig):
     """Options of planning by the cross-entropy method."""
 
@@ -35,9 +35,9 @@ class CEMPlannerConfig(PlannerConfig):
     momentum: float = 0.1
     """Fraction of mean and standard deviation that each generation keeps."""
 
-    def check(self) -> None:
+    def check_planner(self) -> None:
         """Check what the types do not express."""
-        super().check()
+        super().check_planner()
         check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites must be between 2 and candidates, {self.candidates}, got {self.elites}")

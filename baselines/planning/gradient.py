@@ -11,7 +11,7 @@ from cfp.validation import check_positive
 from dittogym.model import EnvState
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GradientPlannerConfig(PlannerConfig):
     """Options of planning by gradients."""
 
@@ -22,9 +22,9 @@ class GradientPlannerConfig(PlannerConfig):
     clip: float = 3.0
     """Clip the gradient of a control step to this multiple of the median norm over the steps of the plan."""
 
-    def check(self) -> None:
+    def check_planner(self) -> None:
         """Check what the types do not express."""
-        super().check()
+        super().check_planner()
         check_positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 
 

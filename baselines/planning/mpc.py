@@ -1,23 +1,22 @@
 """Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from baselines.common.grid import Grid, GridConfig
-from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
+from baselines.common.grid import Grid, OptimisationConfig, long_dt
+from baselines.common.open_loop import OpenLoop, OpenLoopLearner
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
-from cfp.analytic.config import OptimisationConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.experiment.algorithm import Scalars, Sees
+from cfp.learner import Scalars, Sees
 from cfp.presets import sac_preset
-from cfp.sections import ReportConfig
 from dittogym import make_spec
 
 #: Every scalar that ``MPC.update`` logs, and what it means.
@@ -29,15 +28,13 @@ METRICS: dict[str, str] = {
 }
 
 
-@dataclass(frozen=True)
-class PlannedConfig(OptimisationConfig, GridConfig):
+@dataclass(frozen=True, kw_only=True)
+class PlannedConfig(PlannerConfig, OptimisationConfig):
     """A planned episode: one robot on the layout of the seed, from the start to the end of the task.
 
     The environment options say where plans are carried out and evaluated; train_particles and train_dt, where they are
     tried.
     """
-
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which the only stage ends, at the latest."""
@@ -50,31 +47,30 @@ class PlannedConfig(OptimisationConfig, GridConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        if self.environment.num_envs != 1:
-            raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.environment.num_envs}")
+        self.check_planner()
+        if self.num_envs != 1:
+            raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.num_envs}")
 
 
-@dataclass(frozen=True)
-class MPCConfig(PlannedConfig):
+@dataclass(frozen=True, kw_only=True)
+class MPCConfig(GradientPlannerConfig, PlannedConfig):
     """An episode planned by gradients: one robot on the layout of the seed, from the start to the end of the task."""
 
     algo: str = "mpc"
     """Which algorithm."""
-    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
 
 
-@dataclass(frozen=True)
-class CEMConfig(PlannedConfig):
+@dataclass(frozen=True, kw_only=True)
+class CEMConfig(CEMPlannerConfig, PlannedConfig):
     """An episode planned by the cross-entropy method: one robot on the layout of the seed, start to end of the task."""
 
     algo: str = "cem"
     """Which algorithm."""
-    planner: CEMPlannerConfig = field(default_factory=CEMPlannerConfig)
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.planner.check_grid(self.resolution(1))
+        self.check_grid(self.resolution(1))
 
 
 def planner_preset(task: str) -> tuple[GradientPlannerConfig, Grid]:
@@ -88,22 +84,22 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
     """Options of `PlannedConfig` for a task."""
     base, horizon = sac_preset(task, name), make_spec(task).horizon
     return {
+        **vars(base.environment),
+        "num_envs": 1,
         "task": task,
         "preset": name,
-        "environment": replace(base.environment, num_envs=1),
-        "report": ReportConfig(
-            eval_every=horizon // 4 + 1,
-            eval_episodes=1,
-            eval_deterministic=True,
-            checkpoint_every=horizon // 20 + 1,
-            log_every=10,
-        ),
+        "eval_every": horizon // 4 + 1,
+        "eval_episodes": 1,
+        "eval_deterministic": True,
+        "checkpoint_every": horizon // 20 + 1,
+        "log_every": 10,
         "grid": planner_preset(task)[1],
         "train_particles": None if name == "quick" else "lite",
+        "train_dt": long_dt(task),
     }
 
 
-class MPC(OpenLoopAlgorithm):
+class MPC(OpenLoopLearner):
     """Model predictive control by gradients, see `GradientPlanner`.
 
     There is nothing to learn: `update` carries out a planned step of a single episode, and the policy is the record of
@@ -115,27 +111,32 @@ class MPC(OpenLoopAlgorithm):
     keeps_best: ClassVar[bool] = False  # an earlier policy is only the beginning of the episode
     planner_type: ClassVar[type[Planner[Any]]] = GradientPlanner
 
-    def __init__(self, config: PlannedConfig, stage: int = 1, start: Any = None) -> None:
+    def __init__(self, config: PlannedConfig) -> None:
         self.config = config
         self.env = make_torch_env(config, config.resolution(1), 1)
         self.env.reset(seed=config.seed)
         self.surrogate = None
-        if config.training_environment != config.environment:
+        if config.for_training() != config:
             cheap = make_torch_env(config.for_training(), config.resolution(1), 1)
             cheap.reset(seed=config.seed)
             self.surrogate = Surrogate(self.env, cheap)
         planning_env = self.surrogate.env if self.surrogate else self.env
-        self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
+        self.planner = self.planner_type(planning_env, config, seed=config.seed)
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total_reward, self.reward = 0.0, 0.0
+
+    @classmethod
+    def create(cls, config: PlannedConfig, stage: int, folder: Path) -> "MPC":
+        """The planner at the beginning of the episode."""
+        return cls(config)
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
         """Defaults of a task."""
-        return MPCConfig(**episode_preset(task, name), planner=planner_preset(task)[0])
+        return MPCConfig(**(episode_preset(task, name) | vars(planner_preset(task)[0])))
 
     @property
-    def policy(self) -> OpenLoop:
+    def trained_policy(self) -> OpenLoop:
         """The record so far, with its layout."""
         return OpenLoop(self.actions, {"layout": self.config.seed})
 

@@ -1,1 +1,1 @@
-"""The learner ``analytic``: the coarse-to-fine policy, trained by gradients through the simulation."""
+"""``cfp-analytic``: the coarse-to-fine policy, learned by gradients through the simulation."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfp.analytic.stateful import Stateful
+from cfp.learner import Resumable
 
 #: Gradients of single actions longer than this many running medians are shortened to it.
 OUTLIER = 3.0
@@ -20,7 +20,7 @@ HISTORY = 2_000
 BOUND = 2.5
 
 
-class ActionStep(Stateful):
+class ActionStep(Resumable):
     """Normalised gradient descent on the actions of a window, before tanh.
 
     Attributes:

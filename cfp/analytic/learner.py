@@ -5,9 +5,8 @@ The policy sees the image only. The critic sees the state of the simulation, and
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -15,22 +14,18 @@ from torch import Tensor
 
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.action_step import BOUND, ActionStep
-from cfp.analytic.config import AnalyticConfig
-from cfp.analytic.critic import Critic, mlp
-from cfp.analytic.features import StateFeatures
+from cfp.analytic.critic import Critic, StateFeatures, mlp
 from cfp.analytic.regression import ImageMemory, Regression
-from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
-from cfp.envs.make import choose_device, make_torch_env
+from cfp.config import AnalyticConfig, of_stage
+from cfp.envs.make import choose_device, make_env
 from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.experiment.algorithm import Scalars
-from cfp.experiment.schedules import linear_decay
-from cfp.experiment.stages import CoarseToFineStages, refines
+from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, linear_decay, refines
 from cfp.presets import analytic_preset
 
-#: Every scalar that ``AnalyticLearner.update`` logs, and what it means.
+#: Every scalar that ``CFPAnalytic.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
@@ -43,11 +38,19 @@ METRICS: dict[str, str] = {
 MOST_EMPTY_WINDOWS = 10
 
 
-class AnalyticLearner(Stateful, CoarseToFineStages):
+class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     """Learns a stage of the coarse-to-fine policy by gradients through the simulation.
 
     Each update rolls out a window (SHAC), takes a normalised gradient step on its actions and regresses the actor onto
-    the result (PODS), and trains a privileged critic that values the window's end (SHAC, D.Va).
+    the result (PODS), and trains a privileged critic that values the window's end (SHAC, D.Va). ``predict`` acts by the
+    actor with averaged weights.
+
+    Args:
+        policy: ``"NetworksPolicy"``.
+        env: A `cfp.TorchVecEnv`, in which it is trained; num_envs, particles and substeps are the environment's.
+        config: Options, see `cfp.preset`.
+        stage: Which stage it learns, 1 is the coarsest.
+        device: Of networks and simulation.
     """
 
     config: AnalyticConfig
@@ -55,45 +58,57 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     values = ("generator", "empty_windows")
     presets = ("quick",)
 
-    def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
-        self.config, self.stage = config, stage
-        self.env = make_torch_env(config.for_training(), config.action_size(stage))
-        actor.fix_std()
-        self.actor = actor
-        self.regression = Regression(actor, config.learning_rate, config.weight_average, config.max_grad_norm)
-        features = StateFeatures(displacement=config.displacement)
+    def _setup_model(self) -> None:
+        config = self.config
         with seeded(config.seed):
-            critic = mlp(features.size(len(self.env.spec.bodies) - 1), 1).to(self.env.device)
+            self.actor = build_actor(config.actor_spec(self.stage)).to(self.device)
+        self.actor.fix_std()  # its parameters are not the optimiser's
+        self.regression = Regression(self.actor, config.learning_rate, config.weight_average, config.max_grad_norm)
+        self.features = StateFeatures(displacement=config.displacement)
+        with seeded(config.seed):
+            critic = mlp(self.features.size(len(self.simulation.spec.bodies) - 1), 1).to(self.simulation.device)
         self.critic = Critic(critic, config)
-        self.collector = WindowCollector(self.env, lambda: features(self.env).float(), config)
+        networks = {"learned": self.actor, "value": critic, "target": self.critic.target}
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.trained_actor, **networks)
+        self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
+        self.begin_episodes()
+
+    def begin_episodes(self) -> None:
+        """Start new episodes in all elements of the simulation."""
+        config = self.config
+        self.collector = WindowCollector(self.simulation, lambda: self.features(self.simulation).float(), config)
         self.action_step = ActionStep()
         self.empty_windows = 0
-        self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
-        image = self.env.observation()
+        image = self.simulation.observation()
+        self._last_obs = image.cpu().numpy()
         with torch.no_grad():
-            outputs = actor.outputs(image, deterministic=True, generator=self.generator)
+            outputs = self.actor.outputs(image, deterministic=True, generator=self.generator)
         example = (image[0], outputs.location[0])
-        self.memory = ImageMemory(config.windows_kept * config.update_every, example)
+        self.memory = ImageMemory(config.windows_kept * config.window * self.n_envs, example)
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
         """Default options for a task, see `cfp.preset`."""
-        return replace(analytic_preset(task, name), algo="analytic")
+        return analytic_preset(task, name)
 
     @classmethod
-    def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> AnalyticLearner:
+    def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> CFPAnalytic:
         """Networks, memory and environment of a stage."""
-        with seeded(config.seed):
-            actor = build_actor(config.actor_spec(stage)).to(choose_device(config.device))
-        trained = cls.warm_start(config, stage, folder, actor)
-        algorithm = cls(config, stage, actor)
-        algorithm.starts_trained = trained
-        return algorithm
+        env = make_env(config.for_training(), config.action_size(stage))
+        learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
+        learner.starts_trained = cls.warm_start(config, stage, folder, learner.actor)
+        learner.restart_average()
+        return learner
+
+    def restart_average(self) -> None:
+        """Let the average of the actor's weights begin with those it has now, with a fixed standard deviation."""
+        self.actor.fix_std()
+        self.trained_actor.load_state_dict(self.actor.state_dict())
 
     @classmethod
     def warnings(cls, config: AnalyticConfig, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before their policy learns, and a reward without gradient."""
-        lines = [f"{line}; --learner sac learns from rewards alone" for line in reward_warnings(config)]
+        lines = [f"{line}; --algo cfp-sac learns from rewards alone" for line in reward_warnings(config)]
         warmup = config.warmup * config.update_every
         for stage in range(first_stage, len(config.ends()) + 1):
             starts_trained = stage > 1 or refines(config, folder, stage)
@@ -107,61 +122,69 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         """Environment steps of the warm-up, in which only the critic of a trained policy learns."""
         return self.config.warmup * self.config.update_every
 
-    def update(self) -> Scalars:
-        """Play one window and learn from it.
+    def update(self) -> bool:
+        """Play one window and learn from it; False if a callback stops the training.
 
         Raises:
             NonFiniteError: Actions are not finite, or no gradient of the last windows was.
         """
         config, progress = self.config, self.progress
         learning_rate = config.learning_rate * linear_decay(progress)
-        step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
+        step_size = of_stage(config.action_step, self.stage) * linear_decay(progress, config.final_step)
         minibatches = config.minibatches
         if self.starts_trained and self.num_timesteps < self.steps_without_change:
             # steps towards the values of an untrained critic, fitted to a few windows, would spoil the policy
             step_size, minibatches = 0.0, 0
-        images, improved, window = self._improve(step_size)
+        played = self._improve(step_size)
+        if played is None:
+            return False
+        images, improved, window = played
         self.memory.add(images, improved.flatten(0, 1))
         regression_loss = torch.zeros(())
         for _ in range(minibatches):
             batch = self.memory.sample(config.minibatch_size, self.generator)
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += config.update_every
-        return self.collector.scalars(window) | {
+        own = {
             "train/critic_loss": critic_loss,
             "train/regression_loss": float(regression_loss),
             "train/action_step": step_size,
             "train/learning_rate": learning_rate,
             "train/limited": float(self.action_step.limited),
         }
+        self.record(self.collector.scalars(window) | own)
+        return True
 
-    def _improve(self, step_size: float) -> tuple[Tensor, Tensor, Window]:
+    def _improve(self, step_size: float) -> tuple[Tensor, Tensor, Window] | None:
         """Simulate a window and take a gradient step on its actions.
 
         Args:
             step_size: Root mean square of the step; 0: none, and no gradients are computed.
 
         Returns:
-            Images (T B, 3, 64, 64), improved locations (T, B, C, R, R), and the window before the step.
+            Images (T B, 3, 64, 64), improved locations (T, B, C, R, R), and the window before the step; None if a
+            callback stops the training.
         """
         images: list[Tensor] = []
         leaves: list[Tensor] = []
 
         def act(_: Tensor) -> Tensor:
-            images.append(self.env.observation())
+            images.append(self.simulation.observation())
             with torch.no_grad():
                 outputs = self.actor.outputs(images[-1], generator=self.generator)
                 leaves.append(outputs.location.clamp(-BOUND, BOUND))
             return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
 
         with torch.set_grad_enabled(step_size > 0):
-            window = self.collector.collect(act, self.critic)
+            window = self.collector.collect(act, self.critic, self.after_step)
+        self._callback.on_rollout_end()
+        if window is None:
+            return None
         actions = torch.stack(leaves).detach()
         if not step_size:
             return torch.cat(images), actions, window
         gradients = torch.stack(torch.autograd.grad(short_horizon_loss(window, self.config.gamma), leaves))
-        self.env.detach()
+        self.simulation.detach()
         self.empty_windows = 0 if gradients.any() else self.empty_windows + 1
         if self.empty_windows >= MOST_EMPTY_WINDOWS:
             raise NonFiniteError(
@@ -171,20 +194,22 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         improved = self.action_step(actions, gradients, step_size)
         return torch.cat(images), improved, window
 
-    def row(self) -> Scalars:
-        """Scalars of the last update, with the mean return of the episodes that ended since the last row."""
+    def log_row(self) -> None:
+        """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
-        return self.scalars
 
     def images(self) -> dict[str, np.ndarray]:
         """What the policy does with the observation of the first robot."""
-        return policy_pictures(self.trained_actor, self.env.observation()[:1])
+        return policy_pictures(self.trained_actor, self.simulation.observation()[:1])
 
     @property
     def trained_actor(self) -> Actor:
         """The actor with averaged weights."""
         return cast(Actor, self.regression.average.module)
 
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actor with averaged weights."""
-        super().save_policy(path, description | {"trained_by": self.config.learner})
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "regression.adam", "critic.adam"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        made_again = ["actor", "regression", "features", "critic", "generator", "collector", "action_step", "memory"]
+        return [*super()._excluded_save_params(), *made_again, "_callback"]

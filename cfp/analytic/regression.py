@@ -14,13 +14,13 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
 from cfp.analytic.critic import descend
-from cfp.analytic.stateful import Stateful, compress, decompress
+from cfp.learner import Resumable, compress, decompress
 
 #: Of Adam.
 BETAS = (0.9, 0.95)
 
 
-class ImageMemory(Stateful):
+class ImageMemory(Resumable):
     """The latest pairs of an image (3, 64, 64) uint8 and the location (C, R, R) of the action to take there.
 
     Args:
@@ -56,7 +56,7 @@ class ImageMemory(Stateful):
         self.images = decompress(state["images"], self.images.shape[1:]).to(self.images.device)
 
 
-class Regression(Stateful):
+class Regression(Resumable):
     """Regression of an actor onto locations of actions, and the running average of its weights, which is the policy.
 
     Args:

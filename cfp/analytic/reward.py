@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from cfp.validation import check_at_least, check_positive
+from cfp.config import WindowConfig
 from dittogym import TorchEnv, core
 from dittogym.contract import Moment, Outcome
 from dittogym.spec import TaskSpec
@@ -22,37 +22,6 @@ NEIGHBOURS, MAX_SAMPLES = 6, 500
 RADIUS = 0.03
 #: Fraction of ``RADIUS`` by which they may drift apart at no cost.
 TOLERANCE = 0.25
-
-
-@dataclass(frozen=True)
-class RewardConfig:
-    """The training reward; evaluations always use the task's own."""
-
-    form: Literal["task", "speed"] = "task"
-    """task: the task's own reward, made smooth; speed: 60 per m/s to the right, less the task's cost of action."""
-    split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
-    exceeds split_margin."""
-    split_margin: float = 0.85
-    """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
-    integrity_weight: float = 300.0
-    """Weight of the cost of particles that were neighbours at the start of the window, or of the episode within it, and
-    drift apart."""
-    scale: float = 0.05
-    """Factor on the training reward that keeps the critic's values near one."""
-    success_reward: float = 0.0
-    """Reward per step, discounted, as if the episode went on after it ended in success, for 1 / (1 - gamma) steps,
-    at most 100; 0: none, as in the task."""
-
-    def check(self) -> None:
-        """Check what the types do not express."""
-        check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
-        check_at_least(0, integrity_weight=self.integrity_weight, success_reward=self.success_reward)
-        check_positive(scale=self.scale)
-
-    def success_value(self, gamma: float) -> float:
-        """Value of the end of an episode that ended in success."""
-        return self.scale * self.success_reward / discount_rate(gamma)
 
 
 @tree.register
@@ -91,13 +60,18 @@ def discount_rate(gamma: float) -> float:
     return max(1.0 - gamma, 1e-2)
 
 
+def success_value(config: WindowConfig) -> float:
+    """Value of the end of an episode that ended in success."""
+    return config.reward_scale * config.success_reward / discount_rate(config.gamma)
+
+
 def split_cost(split: Tensor, limit: float, margin: float, weight: float) -> Tensor:
     """Cost (B,) of robots' spread (B,), m, beyond a fraction ``margin`` of the ``limit`` at which they are torn."""
     return weight * (split / limit - margin).clamp_min(0.0).square()
 
 
 def training_reward(
-    config: RewardConfig,
+    config: WindowConfig,
     env: TorchEnv,
     previous_centre: Tensor,
     reward: Tensor,
@@ -106,7 +80,7 @@ def training_reward(
 ) -> Tensor:
     """Training reward (B,) of the environment's last step."""
     terms = info["reward_terms"]
-    if config.form == "speed":
+    if config.reward == "speed":
         seconds = env.model.substeps * env.model.solver.dt
         reward = SPEED_WEIGHT / seconds * (info["com"] - previous_centre)[:, 0] + terms["failure"]
         if "action" in terms:
@@ -116,7 +90,7 @@ def training_reward(
         reward = reward - split_cost(info["split"], limit, config.split_margin, config.split_weight)
     if config.integrity_weight:
         reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.num_robot_particles])
-    return config.scale * torch.where(info["finite"], reward, terms["failure"])
+    return config.reward_scale * torch.where(info["finite"], reward, terms["failure"])
 
 
 def has_gradient(env: TorchEnv) -> bool:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cfp.analytic.config import WindowConfig
-from cfp.analytic.episodes import Episodes
-from cfp.analytic.reward import Neighbours, has_gradient, training_reward
-from cfp.analytic.stateful import Stateful
+from cfp.analytic.reward import Neighbours, has_gradient, success_value, training_reward
+from cfp.config import WindowConfig
 from cfp.envs.make import make_torch_env
+from cfp.envs.vec_env import TorchVecEnv, first_limits
 from cfp.errors import NonFiniteError
+from cfp.learner import Resumable
 from dittogym import TorchEnv
 from torchmpm import tree
 
@@ -41,7 +42,71 @@ class Window(NamedTuple):
     true_reward: float  # mean of the task's own rewards
 
 
-class WindowCollector(Stateful):
+class Episodes(Resumable):
+    """Ends the episodes of an environment and starts new ones.
+
+    Episodes are truncated after ``max_episode_steps``; the first one of element i of the batch already after a fraction
+    ``(i + 1) / B`` of them, so that the simulations are of different ages. A simulation that is not finite ends like
+    any other, and is counted.
+    """
+
+    values = ("limit", "returns", "num_started", "counts", "recent_returns")
+
+    def __init__(self, env: TorchEnv, seed: int, max_episode_steps: int, num_layouts: int) -> None:
+        self.env, self.num_layouts = env, num_layouts
+        count = env.num_envs
+        self.first_seed = seed + count
+        env.reset(seed=[self.first_seed + i % num_layouts for i in range(count)])
+        self.max_steps = min(max_episode_steps, env.spec.horizon)
+        self.limit = first_limits(count, self.max_steps, env.device)
+        self.returns = torch.zeros(count, device=env.device)
+        self.recent_returns: list[float] = []  # undiscounted; of the episodes since the list was last emptied
+        self.num_started = count
+        self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
+
+    def record(self, reward: Tensor, terminated: Tensor) -> Tensor:
+        """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool."""
+        self.returns = self.returns + reward  # not in place: a saved state may hold it
+        return terminated | (self.env.env_state.steps >= self.limit)
+
+    def infos(self, done: Tensor) -> list[dict[str, Any]]:
+        """Return and length of each episode that is ``done`` (B,), as stable-baselines3's ``Monitor`` reports them."""
+        infos: list[dict[str, Any]] = [{} for _ in range(len(done))]
+        for i in done.nonzero()[:, 0].tolist():
+            infos[i]["episode"] = {"r": float(self.returns[i]), "l": int(self.env.env_state.steps[i])}
+        return infos
+
+    def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:
+        """Start new episodes where ``done`` (B,), each on the next layout; count how they ended."""
+        seeds = [0] * self.env.num_envs
+        for i in done.nonzero()[:, 0].tolist():
+            self.counts["episodes"] += 1
+            self.counts["terminated"] += int(terminated[i])
+            self.counts["nonfinite"] += int(~finite[i])
+            self.recent_returns.append(float(self.returns[i]))
+            seeds[i] = self.first_seed + self.num_started % self.num_layouts
+            self.num_started += 1
+        if bool(done.any()):
+            self.env.reset(seed=seeds, options={"reset_mask": done})
+        self.returns = torch.where(done, 0.0, self.returns)
+        self.limit = torch.where(done, self.max_steps, self.limit)
+
+    def scalars(self) -> dict[str, float | None]:
+        """Counts, and the mean of `recent_returns`."""
+        scalars: dict[str, float | None] = {f"train/{name}": float(count) for name, count in self.counts.items()}
+        return scalars | {"rollout/return": float(np.mean(self.recent_returns)) if self.recent_returns else None}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The episodes in progress, and what the next ones depend on."""
+        return super().state_dict() | {"env": TorchVecEnv(self.env).state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        super().load_state_dict(state)
+        TorchVecEnv(self.env).load_state_dict(state["env"])
+
+
+class WindowCollector(Resumable):
     """Collects windows from an environment.
 
     Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
@@ -59,16 +124,26 @@ class WindowCollector(Stateful):
     def __init__(self, env: TorchEnv, observe: Callable[[], Tensor], config: WindowConfig) -> None:
         self.env, self.observe = env, observe
         self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.reward, self.steps = config.reward, config.window
-        self.success_value = config.reward.success_value(config.gamma)
+        self.config = config
+        self.success_value = success_value(config)
         self.dropped = self.dropped_before = 0
 
-    def collect(self, act: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
+    def collect(
+        self,
+        act: Callable[[Tensor], Tensor],
+        value: Callable[[Tensor], Tensor],
+        after_step: Callable[[Tensor, list[dict[str, Any]]], bool],
+    ) -> Window | None:
         """Collect the next window.
 
         Args:
             act: Actions (B, 2, R, R) to execute, from the critic's inputs; it may look at the environment instead.
             value: Values (B,) of the critic's inputs.
+            after_step: Called after each control step, with the episodes that are over, (B,) bool, and one dictionary
+                for each, as stable-baselines3 calls callbacks; False ends the window.
+
+        Returns:
+            The window; None if ``after_step`` ended it.
 
         Raises:
             NonFiniteError: Actions are not finite.
@@ -77,10 +152,10 @@ class WindowCollector(Stateful):
         self.dropped_before = self.dropped
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
-        for _ in range(self.steps):
+        for _ in range(self.config.window):
             centre = env.env_state.centre
             _, smooth_reward, terminated, _, info = env.step(self._guarded(act(observation)), soft=True)
-            reward = training_reward(self.reward, env, centre, smooth_reward, info, neighbours).float()
+            reward = training_reward(self.config, env, centre, smooth_reward, info, neighbours).float()
             next_observation = self.observe()
             success = info.get("is_success", terminated.new_zeros(()))
             final_value = torch.where(success, self.success_value, 0.0)
@@ -88,13 +163,17 @@ class WindowCollector(Stateful):
             true_reward += float(info["true_reward"].detach().mean())
             is_over = self.episodes.record(info["true_reward"].detach(), terminated)
             steps.append((observation.detach(), reward, next_value, is_over))
+            infos = self.episodes.infos(is_over)
             if bool(is_over.any()):
                 self.episodes.restart(is_over, terminated, info["finite"])
                 neighbours = tree.where(is_over, Neighbours.find(self._robot_positions()), neighbours)
                 next_observation = tree.where(is_over, self.observe(), next_observation)
             observation = next_observation
+            if not after_step(is_over, infos):
+                env.detach()
+                return None
         observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))
-        return Window(observations, rewards, next_values, done, true_reward / self.steps)
+        return Window(observations, rewards, next_values, done, true_reward / self.config.window)
 
     def scalars(self, window: Window) -> dict[str, float | None]:
         """What to log of a window, see `WINDOW_METRICS`; warns if most of its gradients were left out."""
@@ -102,7 +181,7 @@ class WindowCollector(Stateful):
             reason = "the reward or the simulation has no finite derivative there"
             warnings.warn(f"most gradients of a window are not finite and were left out: {reason}", stacklevel=2)
         return self.episodes.scalars() | {
-            "train/reward": float(window.rewards.detach().mean()) / self.reward.scale,
+            "train/reward": float(window.rewards.detach().mean()) / self.config.reward_scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
             "train/dropped": float(self.dropped),
@@ -129,7 +208,7 @@ class WindowCollector(Stateful):
 
 def reward_warnings(config: WindowConfig) -> list[str]:
     """A line if no term of the task's own reward has a gradient in the actions, so that only the critic guides."""
-    if config.reward.form == "speed":
+    if config.reward == "speed":
         return []
     env = make_torch_env(config.for_training(), config.action_size(1), 1)
     env.reset(seed=config.seed)

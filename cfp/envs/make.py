@@ -7,10 +7,9 @@ from typing import Any
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
-from cfp.config import RunConfig
+from cfp.config import TASK_OPTIONS, RunConfig
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
-from cfp.sections import TASK_OPTIONS
 from dittogym import TorchEnv
 from dittogym.arguments import find_device
 

@@ -18,10 +18,9 @@ from torch import Tensor
 
 import torchmpm
 from cfp.agent.actor import Actor
-from cfp.config import RunConfig, to_json
+from cfp.config import RunConfig, differences, to_json
 from cfp.evaluation.returns import Result, to_rows
 from cfp.files import write_atomically, write_text
-from cfp.from_dict import differences
 from cfp.tables import Table, columns, read_table
 from dittogym.observation.image import silhouette
 from dittogym.render.canvas import GROUND, TARGET
@@ -128,7 +127,7 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
         axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
     steps, means = _column(evaluations, "mean")
     _, stds = _column(evaluations, "std")
-    how = "without noise" if config.report.eval_deterministic else "with noise"
+    how = "without noise" if config.eval_deterministic else "with noise"
     if steps:
         axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
     low, high = np.subtract(means, stds), np.add(means, stds)
@@ -209,23 +208,16 @@ def write_page(
 
 
 def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Options, by their dotted names, that differ from the preset: their value, and that of the preset."""
-    changes = differences(to_json(config), to_json(preset))
-    changes.pop("algo", None)  # each algorithm has presets of its own, CFP one for each learner
-    return changes
+    """Options that differ from the preset: their value, and that of the preset."""
+    return differences(to_json(config), to_json(preset))
 
 
 def command_words(config: RunConfig, preset: RunConfig) -> list[str]:
     """The words of the command that trains with these options."""
-    decisive = {"algo": config.algo, "learner": getattr(config, "learner", None)}
-    package = "cfp" if config.algo == "cfp" else "baselines"
-    given = {name: value for name, value in decisive.items() if value and (name, value) != ("algo", "cfp")}
-    given |= {"task": config.task, "preset": config.preset, "seed": config.seed}
-    changed = {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, preset).items()}
-    derived = config.with_derived(preset, changed.keys())  # what training would compute from the others
-    changed |= {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, derived).items()}
-    words = ["python", "-m", f"{package}.train"]
-    for name, value in (given | changed).items():
+    given: dict[str, Any] = {"task": config.task, "algo": config.algo, "preset": config.preset, "seed": config.seed}
+    given |= {name: value for name, (value, _) in changed_options(config, preset).items()}
+    words = ["torchmpm", "train"]
+    for name, value in given.items():
         option = name.replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{option}" if value else f"--no-{option}")

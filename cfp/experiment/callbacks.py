@@ -13,11 +13,11 @@ from tqdm import tqdm
 from cfp.config import RunConfig
 from cfp.evaluation.returns import EpisodesStopped, evaluate, make_trial
 from cfp.evaluation.video import record_episode
-from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
+from cfp.learner import Learner
 from cfp.policy import describe_run
 from cfp.tables import CSVTable
 from dittogym.render.recording import record
@@ -40,29 +40,25 @@ EVALUATION_COLUMNS: dict[str, str] = {
 }
 
 
-class StageFinished(Exception):
-    """A stage ends before its last step because its evaluations no longer improve; its checkpoint is written."""
-
-
 @dataclass
 class Stage:
     """A stage in training."""
 
     config: RunConfig
     folder: Path
-    position: Position
-    algorithm: Algorithm
+    learner: Learner
+    offset: int  # environment steps of the stages before
     evaluation_due: bool = False  # the signal that stopped the last session came during an evaluation
 
     @property
     def number(self) -> int:
         """1 is the first."""
-        return self.position.stage
+        return self.learner.stage
 
     @property
     def step(self) -> int:
         """Environment steps since the beginning of the run."""
-        return self.position.offset + self.algorithm.num_timesteps
+        return self.offset + self.learner.num_timesteps
 
     @property
     def steps_left(self) -> int:
@@ -72,7 +68,7 @@ class Stage:
     def save_policy(self) -> None:
         """Write the present policy as ``policy.safetensors``."""
         description = describe_run(self.config, self.config.algo, self.number, self.step)
-        self.algorithm.save_policy(policy_path(self.folder), description)
+        self.learner.save_policy(policy_path(self.folder), description)
 
 
 class StageCallback(BaseCallback):
@@ -136,7 +132,7 @@ class LogCallback(StageCallback):
     """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, Weights & Biases if asked for."""
 
     def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
-        super().__init__(stage, stage.config.report.log_every)
+        super().__init__(stage, stage.config.log_every)
         self.bar = bar
         self._logged = stage.step
 
@@ -144,16 +140,15 @@ class LogCallback(StageCallback):
         self._clock = time.perf_counter()
 
     def _act(self) -> None:
-        now, step, logger = time.perf_counter(), self.stage.step, self.stage.algorithm.logger
+        now, step, logger = time.perf_counter(), self.stage.step, self.stage.learner.logger
         speed = (step - self._logged) / max(now - self._clock, 1e-9)
         self._logged, self._clock = step, now
-        scalars = self.stage.algorithm.row()
-        for name, value in {"stage": self.stage.number, **scalars}.items():
-            logger.record(name, value)
+        self.stage.learner.log_row()
+        logger.record("stage", self.stage.number)
         logger.record("time/steps_per_second", speed, exclude="csv")
-        logger.dump(step)
-        if (value := scalars.get("rollout/return")) is not None:
+        if (value := logger.name_to_value.get("rollout/return")) is not None:
             self.bar.show(**{"return": value})
+        logger.dump(step)
 
     def _on_training_end(self) -> None:
         if self._logged < self.stage.step:
@@ -169,7 +164,7 @@ class EvaluationCallback(StageCallback):
     def __init__(
         self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback, signals: StopSignals
     ) -> None:
-        super().__init__(stage, stage.config.report.eval_every)
+        super().__init__(stage, stage.config.eval_every)
         self.table, self.tracker, self.bar, self.signals = table, tracker, bar, signals
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
@@ -181,22 +176,16 @@ class EvaluationCallback(StageCallback):
         """Whether the policy of the present step has not been evaluated."""
         return self.every > 0 and self.evaluated < self.stage.step
 
-    @property
-    def has_plateaued(self) -> bool:
-        """Whether the best evaluation is as many evaluations ago as the run is patient."""
-        patience, means = self.stage.config.report.patience, self.means
-        return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
-
     def _is_due(self) -> bool:
-        algorithm = self.stage.algorithm
-        initial = algorithm.starts_trained and algorithm.num_timesteps <= algorithm.steps_without_change
+        learner = self.stage.learner
+        initial = learner.starts_trained and learner.num_timesteps <= learner.steps_without_change
         return super()._is_due() and not (initial and self.means)
 
     def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
-        deterministic = config.report.eval_deterministic
-        trial = make_trial(config, "", stage.algorithm.policy, episodes, deterministic=deterministic, seed=seed)
+        deterministic = config.eval_deterministic
+        trial = make_trial(config, "", stage.learner.trained_policy, episodes, deterministic=deterministic, seed=seed)
         try:
             result = evaluate([trial], should_stop=lambda: self.signals.number != 0)[0]
         except EpisodesStopped:
@@ -205,7 +194,7 @@ class EvaluationCallback(StageCallback):
             stage.evaluation_due = True
             return
         stage.evaluation_due = False
-        if not stage.algorithm.keeps_best or result.mean > max(self.means, default=-float("inf")):
+        if not stage.learner.keeps_best or result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
         self.evaluated = stage.step
@@ -214,11 +203,11 @@ class EvaluationCallback(StageCallback):
         self.table.add(dict(zip(EVALUATION_COLUMNS, values, strict=True)))
         self.seconds += time.perf_counter() - start
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
-        self.tracker.show(stage.step, {**scalars, **stage.algorithm.images()})
+        self.tracker.show(stage.step, {**scalars, **stage.learner.images()})
         self.bar.show(evaluated=result.mean)
 
     def _on_training_start(self) -> None:
-        starts_trained = self.stage.algorithm.starts_trained and self.every and not self.means
+        starts_trained = self.stage.learner.starts_trained and self.every and not self.means
         if starts_trained or (self.stage.evaluation_due and self.is_missing):  # a crash may have come after its row
             self._act()
 
@@ -231,14 +220,14 @@ class FilmCallback(StageCallback):
     """Films one episode on the first layout of the evaluations, into ``videos/``."""
 
     def __init__(self, stage: Stage, tracker: Tracker) -> None:
-        super().__init__(stage, stage.config.report.video_every)
+        super().__init__(stage, stage.config.video_every)
         self.tracker = tracker
 
     def _act(self) -> None:
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
-        (seed, _), deterministic = config.evaluation(stage.number), config.report.eval_deterministic
-        record_episode(config, stage.algorithm.policy, deterministic, seed, record).save(path)
+        (seed, _), deterministic = config.evaluation(stage.number), config.eval_deterministic
+        record_episode(config, stage.learner.trained_policy, deterministic, seed, record).save(path)
         self.tracker.film(stage.step, path)
 
 
@@ -246,15 +235,15 @@ class CheckpointCallback(StageCallback):
     """Writes a checkpoint: at intervals, after each evaluation, before the run is stopped, and at the end."""
 
     def __init__(self, stage: Stage, checkpoint: Checkpoint, evaluation: EvaluationCallback, signals: StopSignals):
-        super().__init__(stage, stage.config.report.checkpoint_every)
+        super().__init__(stage, stage.config.checkpoint_every)
         self.checkpoint, self.evaluation, self.signals = checkpoint, evaluation, signals
         self._saved = stage.step
 
     def _act(self) -> None:
         stage = self.stage
-        if not (stage.algorithm.keeps_best and self.evaluation.every and self.evaluation.means):
+        if not (stage.learner.keeps_best and self.evaluation.every and self.evaluation.means):
             stage.save_policy()
-        self.checkpoint.save(stage.algorithm, stage.config, stage.position, stage.evaluation_due)
+        self.checkpoint.save(stage.learner, stage.config, stage.offset, stage.evaluation_due)
         self._saved = self.stage.step
 
     def _on_rollout_start(self) -> None:
@@ -268,17 +257,12 @@ class CheckpointCallback(StageCallback):
 
 
 class StopCallback(StageCallback):
-    """Stops the run when the user wants to, and the stage when its evaluations no longer improve."""
+    """Stops the run when the user wants to."""
 
-    def __init__(self, stage: Stage, evaluation: EvaluationCallback, signals: StopSignals) -> None:
+    def __init__(self, stage: Stage, signals: StopSignals) -> None:
         super().__init__(stage, 0)
-        self.evaluation, self.signals = evaluation, signals
+        self.signals = signals
 
     def _on_rollout_start(self) -> None:
-        self._on_training_end()
-        if self.evaluation.has_plateaued:
-            raise StageFinished
-
-    def _on_training_end(self) -> None:
         if self.signals.number:
             raise Stopped(self.signals.number)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import os
 import re
 import signal
 import sys
-import typing
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
-import docstring_parser
 import tyro
 
 from cfp.errors import CFPError, NonFiniteError
@@ -69,52 +66,18 @@ def with_examples(about: str, program: str, *examples: str) -> str:
 
 
 def read_command(
-    kind: Callable[..., Command], module: str, examples: Sequence[str], args: Sequence[str] | None, **options: Any
+    kind: Callable[..., Command],
+    module: str,
+    examples: Sequence[str],
+    args: Sequence[str] | None,
+    started: str | None = None,
+    **options: Any,
 ) -> Command:
-    """Read the command line of ``python -m MODULE`` into a dataclass; ``options`` are further ones of `tyro.cli`."""
-    program = program_name(module, args)
+    """Read the command line of ``python -m MODULE`` into a dataclass; ``options`` are further ones of `tyro.cli`.
+
+    Options of nested dataclasses have no prefix.
+    """
+    program = started or program_name(module, args)
     about = with_examples(kind.__doc__ or "", program, *examples)
-    return tyro.cli(kind, prog=program, description=about, args=args, **options)
-
-
-def read_options(
-    default: Any, basic: Sequence[str], *, prog: str, about: str, examples: Sequence[str], args: Sequence[str] | None
-) -> Any:
-    """Read a command line into a dataclass like ``default``; its help shows the options ``basic`` before the others."""
-    about = with_examples(f"{about}\n\n{inspect.getdoc(type(default))}", prog, *examples)
-    if {"-h", "--help"} & set(sys.argv[1:] if args is None else args):
-        default = _basic_first(default, basic)  # the help ends the program, so that nothing is read into it
-    options: Any = {"prog": prog, "description": about, "args": args, "config": (tyro.conf.OmitArgPrefixes,)}
-    return tyro.cli(type(default), default=default, **options)
-
-
-def _basic_first(options: Any, basic: Sequence[str]) -> Any:
-    """The same options with those named ``basic`` in front and all others, in their groups, under ``advanced``."""
-    first: list[Any] = []
-    annotated: Any = Annotated  # type checkers know no types that are made at run time
-
-    def remaining(group: Any) -> Any:
-        hints, texts, others = typing.get_type_hints(type(group), include_extras=True), _descriptions(type(group)), []
-        for field in dataclasses.fields(group):
-            value = getattr(group, field.name)
-            if dataclasses.is_dataclass(value):
-                others.append(_option(field.name, type(nested := remaining(value)), nested))
-            else:
-                hint = annotated[hints[field.name], tyro.conf.arg(help=texts[field.name])]
-                (first if field.name in basic else others).append(_option(field.name, hint, value))
-        return dataclasses.make_dataclass(type(group).__name__, others, namespace={"__doc__": type(group).__doc__})()
-
-    advanced = remaining(options)
-    type(advanced).__doc__ = ""  # what the description says already
-    first.sort(key=lambda option: basic.index(option[0]))
-    return dataclasses.make_dataclass("Options", [*first, _option("advanced", type(advanced), advanced)])()
-
-
-def _option(name: str, hint: Any, value: Any) -> tuple[str, Any, Any]:
-    return name, hint, dataclasses.field(default_factory=lambda: value)
-
-
-def _descriptions(kind: type) -> dict[str, str]:
-    """The strings below the fields of a dataclass and of those that it extends."""
-    bases = map(docstring_parser.parse_from_object, reversed(kind.__mro__[:-1]))
-    return {each.arg_name: " ".join((each.description or "").split()) for base in bases for each in base.params}
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    return tyro.cli(kind, prog=program, description=about, args=args, config=config, **options)

@@ -1,11 +1,15 @@
-"""File names in the folder of a run."""
+"""The folder of a run: names of its files, its options, and a lock so that one process at a time trains in it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
+from filelock import FileLock, Timeout
 from tyro.constructors import PrimitiveConstructorSpec
 
 from cfp.config import RunConfig
@@ -44,14 +48,6 @@ Folder = Annotated[
         str_from_instance=lambda folder: [str(folder)],
     ),
 ]
-
-
-def make_folder(folder: Path) -> None:
-    """Create the folder of the option ``out`` where there is none; `ConfigError` if that cannot be done."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"out: {folder} cannot be created as a folder ({error.strerror})") from error
 
 
 def holds_run(folder: Path) -> bool:
@@ -98,3 +94,34 @@ def policy_files(folder: Path, stages: int) -> dict[str, Path]:
     if newest.exists():
         files[f"stage {read_policy(newest)[1]['stage']}"] = newest
     return files
+
+
+class FolderInUse(CFPError):
+    """Another process holds the folder."""
+
+
+@contextmanager
+def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
+    """Hold the folder of a run, which is created if need be; the system releases it however the process ends."""
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out: {folder} cannot be created as a folder ({error.strerror})") from error
+    path = folder / ".lock"
+    try:
+        lock = FileLock(path).acquire(timeout=timeout)
+    except Timeout:
+        owner = path.read_text().strip() if path.exists() else ""
+        raise FolderInUse(f"out: {folder} is in use by {owner or 'another process'}") from None
+    try:
+        with lock:
+            path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+    finally:
+        if is_new:
+            with suppress(OSError):  # something is in it
+                folder.rmdir()

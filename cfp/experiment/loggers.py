@@ -51,7 +51,7 @@ class EventFile(TensorBoardOutputFormat):
 
 def check_trackers(config: RunConfig) -> None:
     """Refuse options that need a package that is not installed, before anything is written."""
-    every, wandb, install = config.report.video_every, config.report.wandb, "install it with: pip install 'torchmpm"
+    every, wandb, install = config.video_every, config.wandb, "install it with: pip install 'torchmpm"
     if every and not available():
         raise ConfigError(f"video_every must be 0 without imageio and its ffmpeg, got {every}; {install}[video]'")
     if wandb != "off":
@@ -66,16 +66,16 @@ class WandbWriter(KVWriter):
     """A logger output to Weights & Biases; a resumed run continues the same curve."""
 
     def __init__(self, config: RunConfig, folder: Path) -> None:
-        report, self.wandb = config.report, importlib.import_module("wandb")
+        self.wandb = importlib.import_module("wandb")
         identity = folder / "wandb-id.txt"
         if not identity.exists():
             write_text(identity, uuid.uuid4().hex[:8])
         self.run = self.wandb.init(
-            project=report.wandb_project,
+            project=config.wandb_project,
             name=config.name,
             id=identity.read_text().strip(),
             resume="allow",
-            mode=report.wandb,
+            mode=config.wandb,
             dir=str(folder),
             config=to_json(config),
         )
@@ -102,7 +102,7 @@ class Tracker:
     """The places to which a run's rows go besides its tables, and pictures and films that only they take."""
 
     def __init__(self, config: RunConfig, folder: Path, step: int) -> None:
-        self.wandb = WandbWriter(config, folder) if config.report.wandb != "off" else None
+        self.wandb = WandbWriter(config, folder) if config.wandb != "off" else None
         events = EventFile(folder / "tensorboard", step)
         self.writers: list[KVWriter] = [events, self.wandb] if self.wandb else [events]
         self._logger = Logger(None, self.writers)

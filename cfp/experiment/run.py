@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
-from tqdm import tqdm
 
-from cfp.config import CoarseToFineConfig, RunConfig, to_json
+from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.page import plot_curve, write_page
 from cfp.evaluation.returns import compare, format_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
-from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.callbacks import (
     CheckpointCallback,
     EvaluationCallback,
@@ -28,7 +26,6 @@ from cfp.experiment.callbacks import (
     LogCallback,
     ProgressBarCallback,
     Stage,
-    StageFinished,
     StopCallback,
 )
 from cfp.experiment.checkpoint import Checkpoint, check_same
@@ -36,6 +33,7 @@ from cfp.experiment.folder import holds_progress, holds_run, policy_files, polic
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import read_json, write_atomically, write_json
+from cfp.learner import Learner
 from cfp.policy import copy_policy, is_of_another_task, read_policy
 from cfp.presets import like_start
 from cfp.tables import CSVTable
@@ -48,12 +46,11 @@ def check_options(config: RunConfig) -> None:
     check_trackers(config)
     for stage in range(1, len(config.ends()) + 1):
         make_env(config, config.action_size(stage), 1)
-    if config.training_environment != config.environment:
+    if config.for_training() != config:
         try:
             make_env(config.for_training(), config.action_size(1), 1)
         except ConfigError as error:
-            names = (name for name in ("train_dt", "train_particles") if hasattr(config, name))
-            raise ConfigError(f"{' or '.join(names)}: {error}") from error
+            raise ConfigError(f"train_dt or train_particles: {error}") from error
 
 
 class TrainingRun:
@@ -64,14 +61,14 @@ class TrainingRun:
     """
 
     def __init__(
-        self, algorithm: type[Algorithm], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
+        self, learner: type[Learner], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
     ) -> None:
         check_options(config)
         if holds_progress(folder) and not resume:
             raise ConfigError(
                 f"out: {folder} already holds a run; continue it with --resume (resume=True), or name another folder"
             )
-        self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
+        self.learner, self.config, self.folder, self.signals = learner, config, folder, signals
         self.stages = len(config.ends())
         self.preparation_seconds = 0.0  # before the first stage, in this session
         self.evaluation_seconds = 0.0  # in this session
@@ -87,8 +84,8 @@ class TrainingRun:
                 raise CheckpointError(f"{folder}: the run is finished, but its checkpoint is missing")
             if holds_run(folder):
                 print(f"{folder} holds no checkpoint: starting from the beginning")
-            self.position = algorithm.initialize(config, folder)
-            self.step = self.position.offset
+            self.stage, self.offset = learner.begin(config, folder)
+            self.step = self.offset
         write_json(folder / "config.json", to_json(config))
         self._save_target()
         self.evaluations = CSVTable(folder / "evaluations.csv", self.step, ("step", "stage", "mean"))
@@ -98,7 +95,7 @@ class TrainingRun:
 
     def _save_target(self) -> None:
         """Show the target that the user has chosen as it is used."""
-        target, path = self.config.environment.target, self.folder / "target.png"
+        target, path = self.config.target, self.folder / "target.png"
         used = self.config.make_spec().target
         if target is not None and used is not None:
             pixels = np.where(used, 0, 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
@@ -115,69 +112,68 @@ class TrainingRun:
             raise CheckpointError(f"{path}: cannot be read ({error})") from error
 
     def _read_checkpoint(self) -> None:
-        """Set state, position and step from the checkpoint."""
+        """Set state, stage and step from the checkpoint."""
         config, folder, self.state = self.config, self.folder, self.checkpoint.read()
         past, total = json.loads(self.state["config"]), config.ends()[-1]
         check_same(past, config)
-        self.position = Position(self.state["stage"], self.state["offset"])
-        if self.position.stage > self.stages:
-            raise self.checkpoint.does_not_fit(ValueError(f"it is of stage {self.position.stage}"))
-        self.step = self.position.offset + self.state["num_timesteps"]
+        self.stage, self.offset = self.state["stage"], self.state["offset"]
+        if self.stage > self.stages:
+            raise self.checkpoint.does_not_fit(ValueError(f"it is of stage {self.stage}"))
+        self.step = self.offset + self.state["num_timesteps"]
         if total < min(self.step, past.get("steps", 0)):
             raise ConfigError(f"steps must be at least {self.step}, those that the run has taken, got {total}")
-        print(f"resuming {folder} at step {self.step} of {total} (stage {self.position.stage})")
+        print(f"resuming {folder} at step {self.step} of {total} (stage {self.stage})")
         newest = policy_path(folder)
         if newest.exists() and is_of_another_task(read_policy(newest)[1], config):
             print(f"a file of task {config.task!r} has changed: evaluations from before it are of another task")
 
     def train(self) -> None:
         """Train the stages that are left."""
-        for line in self.algorithm.warnings(self.config, self.folder, self.position.stage):
+        for line in self.learner.warnings(self.config, self.folder, self.stage):
             print(line)
         start = time.perf_counter()
         try:
             try:
-                self.algorithm.prepare(self.config, self.folder, self.signals)
+                self.learner.prepare(self.config, self.folder, self.signals)
             finally:
                 self.preparation_seconds = time.perf_counter() - start
-            for number in range(self.position.stage, self.stages + 1):
-                self.position = Position(number, self.position.offset)
+            for number in range(self.stage, self.stages + 1):
+                self.stage = number
                 due = self.state is not None and self.state.get("evaluation_due", False)
-                algorithm = self._create()
-                self._train_stage(Stage(self.config, self.folder, self.position, algorithm, due))
+                learner = self._create()
+                self._train_stage(Stage(self.config, self.folder, learner, self.offset, due))
                 newest = policy_path(self.folder)  # of the next stage already, if this repeats the end after a crash
                 if number < self.stages and read_policy(newest)[1]["stage"] == number:
                     copy_policy(newest, policy_path(self.folder, number))
-                self.position = Position(number, self.position.offset + algorithm.num_timesteps)
+                self.offset += learner.num_timesteps
         except NonFiniteError as error:
             raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
         finally:
             self.seconds = self.checkpoint.seconds
             self.logger.close()
 
-    def _create(self) -> Algorithm:
-        """The algorithm of the present stage: at its beginning, or as the checkpoint holds it."""
+    def _create(self) -> Learner:
+        """The learner of the present stage: at its beginning, or as the checkpoint holds it."""
         try:
-            algorithm = self.algorithm.create(self.config, self.position.stage, self.folder)
+            learner = self.learner.create(self.config, self.stage, self.folder)
         except CFPError:
             if not self.checkpoint.path.exists():  # options that it refuses leave no run behind
                 (self.folder / "config.json").unlink()
                 self.logger.close()
                 shutil.rmtree(self.folder / "tensorboard")
             raise
-        algorithm.set_logger(self.logger)
+        learner.set_logger(self.logger)
         if self.state is not None:
-            self.checkpoint.restore(algorithm, self.state)
+            self.checkpoint.restore(learner, self.state)
             self.state = None
-        return algorithm
+        return learner
 
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
         bar = ProgressBarCallback(stage)
         evaluation = EvaluationCallback(stage, self.evaluations, self.tracker, bar, self.signals)
         # A process killed after the last step but before the last evaluation still has to evaluate.
-        done = evaluation.has_plateaued if stage.steps_left else not evaluation.is_missing
-        if done:
+        if not stage.steps_left and not evaluation.is_missing:
             return
         (self.folder / "results.json").unlink(missing_ok=True)  # of an earlier end of the run
         callbacks = CallbackList(
@@ -186,16 +182,12 @@ class TrainingRun:
                 LogCallback(stage, bar),
                 evaluation,
                 CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
-                StopCallback(stage, evaluation, self.signals),
+                StopCallback(stage, self.signals),
                 FilmCallback(stage, self.tracker),  # which a stop need not wait for
             ]
         )
         try:
-            stage.algorithm.learn(stage.steps_left, callbacks)
-        except StageFinished:
-            callbacks.on_training_end()  # which `learn` has not reached
-            patience = self.config.report.patience
-            tqdm.write(f"stage {stage.number} ends early: {patience} evaluations without a new best")
+            stage.learner.learn(stage.steps_left, callbacks, None, reset_num_timesteps=False)
         finally:
             self.step = stage.step
             self.evaluation_seconds += evaluation.seconds
@@ -204,8 +196,8 @@ class TrainingRun:
     def finish(self) -> None:
         """After training: print the final table, and write ``results.json``, curve, video and page."""
         device, files = choose_device(self.config.device), policy_files(self.folder, self.stages)
-        policies = {name: self.algorithm.load(path, device) for name, path in files.items()}
-        results = compare(self.config, policies, self.config.report.eval_episodes)
+        policies = {name: self.learner.load_policy(path, device) for name, path in files.items()}
+        results = compare(self.config, policies, self.config.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
         print(format_table(self.config, results))
         best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
@@ -214,13 +206,12 @@ class TrainingRun:
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         recording = None
-        if self.config.report.video:
+        if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        config = self.config
-        preset = self.algorithm.preset(config.task, config.preset)
-        if isinstance(config, CoarseToFineConfig) and config.start_from is not None:
-            with suppress(CheckpointError, ConfigError):  # it may be gone by now, or the hub's client be missing
-                preset = like_start(preset, {"start_from": config.start_from, "refine": config.refine})
+        preset = self.learner.preset(self.config.task, self.config.preset)
+        with suppress(CheckpointError, ConfigError):  # what it started from may be gone, or the hub's client be missing
+            start = {name: getattr(self.config, name, None) for name in ("start_from", "refine")}
+            preset = like_start(preset, start)
         page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
         print(f"all of it on one page: {page}")

@@ -1,34 +1,43 @@
-"""Short-horizon actor-critic: a policy trained by gradients through the simulation (Xu et al., ICLR 2022)."""
+"""Short-horizon actor-critic (SHAC; Xu et al., ICLR 2022): a policy trained by gradients through the simulation."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass, replace
+import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from baselines.common.grid import GridConfig
-from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic
-from cfp.analytic.config import WindowConfig
-from cfp.analytic.critic import BETAS, Critic, mlp
-from cfp.analytic.features import StateFeatures
-from cfp.analytic.reward import RewardConfig
-from cfp.analytic.stateful import Stateful
+from baselines.common.grid import GridConfig, long_dt
+from baselines.common.policies import StateBasedPolicy, load_network
+from cfp.agent.actor import LATENT, Actor, ActorSpec, Encoder, initialise
+from cfp.analytic.critic import BETAS, Critic, StateFeatures, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
-from cfp.config import RunConfig
-from cfp.envs.make import choose_device, make_torch_env
+from cfp.config import RunConfig, WindowConfig
+from cfp.envs.make import choose_device, make_env
 from cfp.envs.seeding import seeded
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
 from cfp.experiment.folder import start_path
-from cfp.experiment.schedules import linear_decay
-from cfp.policy import KIND, ActorPolicy, copy_policy, load, policy_for, read_policy
+from cfp.learner import Learner, NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
+from cfp.policy import (
+    KIND,
+    ActorPolicy,
+    Memory,
+    copy_policy,
+    load,
+    policy_for,
+    read_policy,
+    report_mismatch,
+    write_policy,
+)
 from cfp.presets import ON_SPEED, sac_preset
-from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
+from dittogym import TorchEnv
+from dittogym.spec import TaskSpec
 
 #: Updates in a row without a finite gradient after which training gives up.
 PATIENCE = 10
@@ -43,8 +52,8 @@ METRICS: dict[str, str] = {
 }
 
 
-@dataclass(frozen=True)
-class ShacConfig(WindowConfig, GridConfig):
+@dataclass(frozen=True, kw_only=True)
+class ShacConfig(GridConfig, WindowConfig):
     """A run of short-horizon actor-critic; num_envs robots learn side by side.
 
     The environment options say where the policy is evaluated; train_particles, where it is trained.
@@ -73,11 +82,6 @@ class ShacConfig(WindowConfig, GridConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
-    def ineffective(self) -> dict[str, str]:
-        """Parts of the state have no effect where the policy sees the image."""
-        parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "displacement"), "sees state")
-        return super().ineffective() | parts
-
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
@@ -87,7 +91,89 @@ class ShacConfig(WindowConfig, GridConfig):
         check_at_least(0, noise=self.noise)
 
 
-class Shac(Stateful, Algorithm):
+class StateActor(nn.Module):
+    """Mean action before tanh, (B, 2, R, R), from features (B, D)."""
+
+    def __init__(self, inputs: int, resolution: int) -> None:
+        super().__init__()
+        self.inputs, self.resolution = inputs, resolution
+        self.body = mlp(inputs, 2 * resolution**2)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Mean before tanh."""
+        output: Tensor = self.body(features)
+        return output.unflatten(1, (2, self.resolution, self.resolution))
+
+
+class ImageActor(nn.Module):
+    """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed."""
+
+    def __init__(self, resolution: int) -> None:
+        super().__init__()
+        self.spec = ActorSpec((resolution,))
+        self.actor = Actor(resolution, self.spec)
+        self.actor.fix_std()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Mean before tanh, (B, 2, R, R), of images (B, 3, 64, 64) in [-1, 1]."""
+        mean: Tensor = self.actor.mean(self.actor.encoder(image))
+        return mean
+
+
+def image_critic() -> nn.Module:
+    """Value (B, 1) of images (B, 3, 64, 64) in [-1, 1], with an encoder like the actor's."""
+    return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), mlp(LATENT, 1)))
+
+
+class StatePolicy(StateBasedPolicy):
+    """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
+
+    ``noise`` is the standard deviation before tanh of actions that are not deterministic; ``description`` says what the
+    policy is and where it comes from, see `cfp.policy.describe_run`.
+    """
+
+    def __init__(
+        self, actor: StateActor, features: StateFeatures, noise: float, description: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__(description)
+        self.actor, self.features, self.noise = actor, features, noise
+
+    @property
+    def resolution(self) -> int:
+        """Action grid R."""
+        return self.actor.resolution
+
+    @property
+    def num_inputs(self) -> int:
+        """Number of features that the network takes."""
+        return self.actor.inputs
+
+    def num_features(self, spec: TaskSpec) -> int:
+        """Number of features of a task."""
+        return self.features.size(len(spec.bodies) - 1)
+
+    def _act(self, env: TorchEnv, state: Memory, deterministic: bool) -> tuple[Tensor, Memory]:
+        mean = self.actor(self.features(env).float().to(next(self.actor.parameters()).device))
+        if not deterministic:
+            mean = mean + self.noise * torch.randn_like(mean)
+        return mean.tanh(), state
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
+        own = {"features": dataclasses.asdict(self.features), "noise": self.noise, "inputs": self.actor.inputs}
+        write_policy(path, self.actor.state_dict(), self.description | own)
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> StatePolicy:
+        """Load what `save` wrote."""
+        tensors, description = read_policy(path, device)
+        with report_mismatch(path):
+            size = description["inputs"], description["resolution"]
+            actor = load_network(lambda: StateActor(*size), tensors, device)
+            return cls(actor, StateFeatures(**description["features"]), float(description["noise"]), description)
+
+
+class Shac(Resumable, UpdateLoop, Learner):
     """Actor and critic on windows of differentiable simulation.
 
     The actor maximises the discounted rewards of a window plus the target critic's value of its end, through the
@@ -98,35 +184,37 @@ class Shac(Stateful, Algorithm):
     parts = ("actor", "actor_adam", "critic", "collector")
     values = ("generator", "skipped", "skipped_in_a_row")
 
-    def __init__(self, config: ShacConfig, stage: int = 1, start: ActorPolicy | None = None) -> None:
-        self.config = config
-        self.env = make_torch_env(config.for_training(), config.resolution(stage))
+    def _setup_model(self) -> None:
+        config = self.config
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with seeded(config.seed):
             self.actor, critic = self._make_networks()
-        if start is not None:
-            assert isinstance(self.actor, ImageActor)
-            self.actor.actor.load_state_dict(start.actor.state_dict())
-            self.actor.actor.fix_std()
         self.critic = Critic(critic, config)
         trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.collector = WindowCollector(self.env, self.observe, config)
+        networks = {"value": critic, "target": self.critic.target}
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor, **networks)
+        self.begin_episodes()
+
+    def begin_episodes(self) -> None:
+        """Start new episodes in all elements of the simulation."""
+        self.collector = WindowCollector(self.simulation, self.observe, self.config)
+        self._last_obs = self.simulation.observation().cpu().numpy()
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
-        grid, device = self.env.action_resolution, self.env.device
+        env, device = self.simulation, self.simulation.device
         if self.config.sees == "image":
-            return ImageActor(grid).to(device), image_critic().to(device)
-        size = self.features.size(len(self.env.spec.bodies) - 1)
-        return StateActor(size, grid).to(device), mlp(size, 1).to(device)
+            return ImageActor(env.action_resolution).to(device), image_critic().to(device)
+        size = self.features.size(len(env.spec.bodies) - 1)
+        return StateActor(size, env.action_resolution).to(device), mlp(size, 1).to(device)
 
     def observe(self) -> Tensor:
         """Inputs (B, ...) of the networks in the present state."""
         if self.config.sees == "state":
-            return self.features(self.env).float()
-        return self.env.soft_observation().float() * (2.0 / 255.0) - 1.0
+            return self.features(self.simulation).float()
+        return self.simulation.soft_observation().float() * (2.0 / 255.0) - 1.0
 
     def act(self, observation: Tensor) -> Tensor:
         """Actions (B, 2, R, R) with noise for an ``observation`` (B, ...), with the autograd graph of the actor."""
@@ -134,27 +222,35 @@ class Shac(Stateful, Algorithm):
         noise = torch.randn(mean.shape, generator=self.generator).to(mean)
         return (mean + self.config.noise * noise).tanh()
 
-    def update(self) -> Scalars:
-        """Learn from one more window; a `NonFiniteError` if actions, or ten gradients in a row, are not finite."""
+    def update(self) -> bool:
+        """Learn from one more window; False if a callback stops the training.
+
+        Raises:
+            NonFiniteError: Actions, or ten gradients in a row, are not finite.
+        """
         config = self.config
         learning_rate = config.learning_rate * linear_decay(self.progress)
         self.actor_adam.param_groups[0]["lr"] = learning_rate
-        window = self.collector.collect(self.act, self.critic)
+        window = self.collector.collect(self.act, self.critic, self.after_step)
+        self._callback.on_rollout_end()
+        if window is None:
+            return False
         gradient_norm = self._update_actor(window)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += config.window * self.env.num_envs
-        return self.collector.scalars(window) | {
+        own = {
             "train/critic_loss": critic_loss,
             "train/gradient_norm": gradient_norm,
             "train/learning_rate": learning_rate,
             "train/skipped": float(self.skipped),
         }
+        self.record(self.collector.scalars(window) | own)
+        return True
 
     def _update_actor(self, window: Window) -> float | None:
         """Take one step of Adam; returns the gradient's norm, or None if it was not finite and no step was taken."""
         self.actor_adam.zero_grad()
         short_horizon_loss(window, self.config.gamma).backward()
-        self.env.detach()
+        self.simulation.detach()
         parameters = self.actor_adam.param_groups[0]["params"]
         norm = float(nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm))
         if math.isfinite(norm):
@@ -169,15 +265,14 @@ class Shac(Stateful, Algorithm):
             )
         return None
 
-    def row(self) -> Scalars:
-        """Scalars of the last update, with the mean return of the episodes that ended since the last row."""
+    def log_row(self) -> None:
+        """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
-        return self.scalars
 
     @property
-    def policy(self) -> StatePolicy | ActorPolicy:
+    def trained_policy(self) -> StatePolicy | ActorPolicy:
         """What has been learned so far; a policy of the state must be attached to an environment."""
-        deterministic = self.config.report.eval_deterministic
+        deterministic = self.config.eval_deterministic
         if isinstance(self.actor, StateActor):
             return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
         return ActorPolicy(self.actor.spec, deterministic, self.actor.actor)
@@ -192,19 +287,18 @@ class Shac(Stateful, Algorithm):
         base = sac_preset(task, name)
         quick, on_speed = name == "quick", task in ON_SPEED
         return ShacConfig(
+            **(vars(base.environment) | {"num_envs": 4}),
             task=task,
             preset="quick" if quick else "paper",
             steps=13_000 if quick else 52_000,
             learning_rate=1e-3 if quick else 5e-4,
-            environment=replace(base.environment, num_envs=4),
-            report=ReportConfig(
-                eval_every=3200 if quick else 0,
-                eval_episodes=3,
-                eval_deterministic=base.report.eval_deterministic,
-                log_every=320,
-            ),
+            eval_every=3200 if quick else 0,
+            eval_episodes=3,
+            eval_deterministic=base.eval_deterministic,
+            log_every=320,
             displacement=not on_speed,
-            reward=RewardConfig("speed" if on_speed else "task"),
+            reward="speed" if on_speed else "task",
+            train_dt=long_dt(task),
         )
 
     @classmethod
@@ -213,30 +307,33 @@ class Shac(Stateful, Algorithm):
         return reward_warnings(config)
 
     @classmethod
-    def initialize(cls, config: ShacConfig, folder: Path) -> Position:
+    def begin(cls, config: ShacConfig, folder: Path) -> tuple[int, int]:
         """Copy the policy from which the actor starts into the folder, if the options name one."""
         if config.start_from is None:
-            return Position()
+            return 1, 0
         policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
         if policy.spec.encoder != "paper":
-            raise ConfigError(f"start_from must be a policy with encoder paper, got {policy.spec.encoder}")
+            raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
         copy_policy(config.start_from, start_path(folder))
-        return Position()
+        return 1, 0
 
     @classmethod
     def create(cls, config: ShacConfig, stage: int, folder: Path) -> Shac:
         """Networks and environment, with the policy from which the actor starts."""
-        if config.start_from is None:
-            return cls(config)
-        algorithm = cls(config, start=load(start_path(folder), choose_device(config.device)))
-        algorithm.starts_trained = True
-        return algorithm
+        env = make_env(config.for_training(), config.resolution(stage))
+        learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
+        if config.start_from is not None:
+            assert isinstance(learner.actor, ImageActor)
+            learner.actor.actor.load_state_dict(load(start_path(folder)).actor.state_dict())
+            learner.actor.actor.fix_std()
+            learner.starts_trained = True
+        return learner
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy; one of the image becomes a policy of CFP."""
-        policy = self.policy
+        policy = self.trained_policy
         policy.description = {**description, "sees": self.config.sees}
         if isinstance(policy, ActorPolicy):
             network = {"resolutions": [policy.resolution]}
@@ -244,6 +341,6 @@ class Shac(Stateful, Algorithm):
         policy.save(path)
 
     @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:
+    def load_policy(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:
         """Load a policy of either kind."""
         return load(path, device) if read_policy(path)[1]["kind"] == KIND else StatePolicy.load(path, device)

@@ -18,7 +18,7 @@ from cfp.policy import check_images
 
 
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
-    """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
+    """Base class of the policies that `cfp.sac.algorithm.CFP` trains; subclasses create actor and critics.
 
     Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
     """

@@ -2,11 +2,12 @@
 
 Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each tensor is
 clipped separately, the gate is penalised, and the random phase is independent of the start of the updates. Options of
-`cfp.agent.hyperparameters.LearningConfig` add what later publications found; the documentation explains them.
+`cfp.config.LearningConfig` add what later publications found; the documentation explains them.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from typing import Any, ClassVar, cast
 
@@ -18,23 +19,24 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, NetworkInput, upsample
 from cfp.agent.critics import TwinCritic
-from cfp.agent.exploration import CellNoise
-from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.losses import actor_loss, critic_loss, critic_target
-from cfp.agent.policies import CFPPolicy, NetworkPolicy
-from cfp.agent.replay import Composition, ReplayRing
-from cfp.agent.reward_statistics import RewardStatistics
+from cfp.config import Hyperparameters
+from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import NonFiniteError
+from cfp.sac.exploration import CellNoise
+from cfp.sac.policies import CFPPolicy, NetworkPolicy
+from cfp.sac.replay import Composition, ReplayRing
 
 #: Scalars that ``CFP.train`` logs.
 METRICS: dict[str, str] = {
     "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
-    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty, and with refine anchor times train/drift",
+    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
@@ -44,7 +46,6 @@ METRICS: dict[str, str] = {
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
-    "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
 
 
@@ -66,6 +67,88 @@ def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> Tensor:
     return norms
 
 
+class RewardStatistics(nn.Module):
+    """Running mean and variance of raw rewards, updated with each batch before it is normalised.
+
+    ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
+    ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
+
+    Where r is a sum over n steps, some sums end early, at the end of an episode or of the memory. Such a sum counts as
+    ``r / w`` in the statistics, and ``w M`` is subtracted from it, where w is the part of the discount factors that it
+    has; otherwise the mean of the missing rewards would be a penalty for the last states of an episode.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, momentum: float) -> None:
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("variance", torch.ones(()))
+
+    @torch.no_grad()
+    def forward(self, rewards: Tensor, part: Tensor | float = 1.0) -> Tensor:
+        """Update the statistics with raw rewards of any shape and return them normalised; ``part`` is w."""
+        whole = rewards / part
+        self.mean.lerp_(whole.mean(), 1 - self.momentum)
+        self.variance.lerp_(whole.var(), 1 - self.momentum)
+        return (rewards - part * self.mean) / (self.variance.sqrt() + 1e-8)
+
+    def scalars(self) -> dict[str, Tensor]:
+        """Values to log."""
+        return {"reward_mean": self.mean, "reward_std": self.variance.sqrt()}
+
+
+def critic_target(
+    actor: Actor,
+    target: TwinCritic,
+    next_obs: NetworkInput,
+    rewards: Tensor,
+    not_done: Tensor,
+    alpha: Tensor | float,
+    gamma: Tensor | float,
+) -> Tensor:
+    """Target of the critics, ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
+
+    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit. Over n steps, r is their
+    discounted sum, and ``gamma`` its n-th power, (B, 1).
+    """
+    with torch.no_grad():
+        sample = actor.sample_for_critic(next_obs)
+        q_values = smaller_value(target, next_obs, sample.action)
+        return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
+
+
+def smaller_value(critic: TwinCritic, obs: NetworkInput, action: Tensor) -> Tensor:
+    """The smaller one of both critics' values, (B, 1)."""
+    return torch.minimum(*critic(obs, action))
+
+
+def critic_loss(critic: TwinCritic, obs: NetworkInput, actions: Tensor, target_q: Tensor) -> Tensor:
+    """Sum of both critics' mean squared errors for actions (B, 2, R, R) or (B, 2 R R)."""
+    return torch.stack([F.mse_loss(values, target_q) for values in critic(obs, actions)]).sum()
+
+
+def actor_loss(
+    actor: Actor,
+    critic: TwinCritic,
+    obs: NetworkInput,
+    alpha: Tensor,
+    gate_penalty: float,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Mean of ``alpha log pi - min Q`` plus ``gate_penalty`` times a residual actor's gate, and scalars to log."""
+    action, log_prob, gate, _ = actor.sample_for_critic(obs)
+    q_values = smaller_value(critic, obs, action)
+    loss = (alpha * log_prob[:, None] - q_values).mean()
+    scalars = {"q": q_values.detach().mean(), "entropy": -log_prob.detach().mean()}
+    if gate is not None:
+        penalty = gate_penalty * gate.flatten(1).norm(dim=1).mean() / actor.resolution
+        loss = loss + penalty
+        scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
+    return loss, scalars
+
+
 class CFP(SAC):
     """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
@@ -83,7 +166,6 @@ class CFP(SAC):
         ConfigError: A hyperparameter is out of range.
 
     Attributes:
-        origin: Actor to stay close to while it is refined, with the same action grid; None otherwise.
         average: The actor with averaged weights, see `restart_average`; None without ``weight_average``.
     """
 
@@ -103,7 +185,6 @@ class CFP(SAC):
         if unused := UNUSED & sac_options.keys():
             raise TypeError(f"CFP does not use {', '.join(sorted(unused))}")
         self.hyperparameters = hyperparameters
-        self.origin: Actor | None = None
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
         replay = {"seed": sac_options.get("seed"), "composition": Composition.of(spec) if spec else None}
         replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
@@ -168,11 +249,8 @@ class CFP(SAC):
         obs = self.policy.encode(batch.observations)
         with torch.no_grad():
             next_obs = self.policy.encode(batch.next_observations)
-        if self.origin is not None:
-            obs = obs.detach()  # critics that train the encoder would change the policy that is refined
         scalars = self._update_critic(obs, next_obs, batch)
-        own = self.hyperparameters
-        if self.num_timesteps >= own.actor_start:
+        if self.num_timesteps >= self.hyperparameters.actor_start:
             scalars |= self._update_actor(obs.detach())
         actor, critic, target = self.networks()
         if self.average is not None:
@@ -197,9 +275,8 @@ class CFP(SAC):
 
     def _update_actor(self, obs: NetworkInput) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
-        own = self.hyperparameters
         critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
-        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor)
+        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, self.hyperparameters.gate_penalty)
         self._descend(loss, actor.optimizer, "actor")
         critic.requires_grad_(True)
         return scalars | {"actor_loss": loss.detach()}
@@ -285,4 +362,83 @@ class CFP(SAC):
         return [*modules, "reward_statistics", *(["average"] if self.average else [])], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "origin", "noise", "average"]
+        return [*super()._excluded_save_params(), "reward_statistics", "noise", "average"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that it learns and counts but ``num_timesteps`` and the replay buffer, as tensors and plain values."""
+        values = self.logger.name_to_value  # of the row that comes next
+        return {name: part.state_dict() for name, part in self._parts().items()} | {
+            "episodes": self._episode_num,
+            "updates": self._n_updates,
+            "recent": [{key: float(value) for key, value in info.items()} for info in self.ep_info_buffer or ()],
+            "successes": [bool(success) for success in self.ep_success_buffer or ()],
+            "means": {name: (values[name], count) for name, count in self.logger.name_to_count.items()},
+            "environment": self._environment_state(),
+            "random": self._random_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self._episode_num, self._n_updates = state["episodes"], state["updates"]
+        self.ep_info_buffer = deque(state["recent"], maxlen=self._stats_window_size)
+        self.ep_success_buffer = deque(state["successes"], maxlen=self._stats_window_size)
+        for name, (mean, count) in state["means"].items():
+            self.logger.record_mean(name, mean)
+            self.logger.name_to_count[name] = count
+        self._restore_environment(state["environment"])
+        self._restore_random(state["random"])
+
+    def _parts(self) -> dict[str, Any]:
+        """What has a state of its own."""
+        actor, critic, _ = self.networks()
+        optimizers = {"actor_optimizer": actor.optimizer, "critic_optimizer": critic.optimizer}
+        parts = {"policy": self.policy, "reward_statistics": self.reward_statistics, **optimizers}
+        optional = {"noise": self.noise, "average": self.average}
+        return parts | {name: part for name, part in optional.items() if part is not None}
+
+    def _environment_state(self) -> dict[str, Any]:
+        """The episodes in progress: the matter, the sums of their rewards, and what the policy sees next."""
+        monitor, env = self._environments()
+        return {
+            "episodes": env.state_dict(),
+            "generators": env.torch_env.generators,
+            "returns": torch.from_numpy(monitor.episode_returns.copy()),
+            "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
+            "observation": torch.from_numpy(np.array(self._last_obs)),
+        }
+
+    def _restore_environment(self, state: dict[str, Any]) -> None:
+        monitor, env = self._environments()
+        monitor.reset()  # so that later episodes start as they would have
+        env.load_state_dict(state["episodes"])
+        env.torch_env.generators = state["generators"]
+        monitor.episode_returns = state["returns"].numpy().copy()
+        monitor.episode_lengths = state["lengths"].numpy().copy()
+        self._last_obs = state["observation"].numpy().copy()
+
+    def _environments(self) -> tuple[VecMonitor, TorchVecEnv]:
+        monitor = self.get_env()
+        assert isinstance(monitor, VecMonitor) and isinstance(monitor.venv, TorchVecEnv)
+        return monitor, monitor.venv
+
+    def _random_state(self) -> dict[str, Any]:
+        """States of every generator that training draws from: torch's, the replay memory's, the action space's."""
+        assert isinstance(self.replay_buffer, ReplayRing)
+        state: dict[str, Any] = {
+            "torch": torch.get_rng_state(),
+            "replay": self.replay_buffer.generator.bit_generator.state,
+            "actions": self.action_space.np_random.bit_generator.state,
+        }
+        if self.device.type == "cuda":
+            state["cuda"] = torch.cuda.get_rng_state(self.device)
+        return state
+
+    def _restore_random(self, state: dict[str, Any]) -> None:
+        assert isinstance(self.replay_buffer, ReplayRing)
+        torch.set_rng_state(state["torch"])
+        self.replay_buffer.generator.bit_generator.state = state["replay"]
+        self.action_space.np_random.bit_generator.state = state["actions"]
+        if "cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda"], self.device)

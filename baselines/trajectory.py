@@ -2,27 +2,27 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from baselines.common.grid import Grid, GridConfig, find_grid
-from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
+from baselines.common.grid import Grid, OptimisationConfig, find_grid, long_dt
+from baselines.common.open_loop import OpenLoop, OpenLoopLearner
 from baselines.common.rollout import check_differentiable
-from baselines.trajectory.objective import Objective, matches_shape
-from cfp.analytic.config import OptimisationConfig
-from cfp.analytic.stateful import Stateful
-from cfp.config import RunConfig
+from cfp.config import EnvironmentConfig, Particles, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.algorithm import Scalars, Sees
-from cfp.experiment.schedules import FINAL_FRACTION
+from cfp.experiment.folder import policy_path
+from cfp.learner import FINAL_FRACTION, Resumable, Scalars, Sees
 from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
-from dittogym import make_spec
+from dittogym import TorchEnv, make_spec
 from dittogym.action import bicubic
+from dittogym.observation.image import soft_silhouette
+from dittogym.spec import TaskSpec
+from dittogym.tasks.shapematch import reward_fn as overlap
 
 #: Of Adam.
 BETAS = (0.9, 0.98)
@@ -50,8 +50,8 @@ def cosine_decay(progress: float) -> float:
     return FINAL_FRACTION + (1.0 - FINAL_FRACTION) * 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
-@dataclass(frozen=True)
-class GradientConfig(OptimisationConfig, GridConfig):
+@dataclass(frozen=True, kw_only=True)
+class GradientConfig(OptimisationConfig):
     """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
 
     The environment options say where the actions are evaluated; train_particles and train_dt, where they are optimised.
@@ -83,7 +83,7 @@ class GradientConfig(OptimisationConfig, GridConfig):
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which each stage ends."""
         horizon = make_spec(self.task).horizon
-        first = self.iterations * horizon * self.environment.num_envs
+        first = self.iterations * horizon * self.num_envs
         return (first, first + self.polish * horizon) if self.polish else (first,)
 
     def resolution(self, stage: int) -> int:
@@ -93,12 +93,6 @@ class GradientConfig(OptimisationConfig, GridConfig):
     def evaluation(self, stage: int) -> tuple[int, int]:
         """The second stage is evaluated on its own layout."""
         return (self.seed, 1) if stage > 1 else super().evaluation(stage)
-
-    def ineffective(self) -> dict[str, str]:
-        """Options of the second stage have no effect without one, the blur none without the reward of SHAPE MATCH."""
-        polish = {} if self.polish else dict.fromkeys(("polish_grid", "polish_learning_rate"), "polish")
-        blur = {} if matches_shape(make_spec(self.task)) else {"blur": "the reward of shapematch"}
-        return super().ineffective() | polish | blur
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -110,6 +104,47 @@ class GradientConfig(OptimisationConfig, GridConfig):
             raise ConfigError(f"blur must be one or more numbers, none of them negative, got {self.blur}")
 
 
+class Objective:
+    """The negative smooth reward; in SHAPE MATCH, whose reward has no gradient, the difference from the target picture.
+
+    This is the mean absolute difference of the soft silhouette and the target, both blurred. A wide blur pulls matter
+    towards a target that it does not touch, a narrow one shapes the outline.
+    """
+
+    def __init__(self, env: TorchEnv, blur: tuple[float, ...]) -> None:
+        self.target: Tensor | None = None
+        if matches_shape(env.spec):
+            self.target = torch.as_tensor(env.spec.target, device=env.device, dtype=env.dtype)
+            self.blurs = [gaussian_matrix(sigma, len(self.target)).to(self.target) for sigma in blur]
+
+    def phase(self, progress: float) -> int:
+        """Index of the blur at a fraction of the training, 0 to 1. Losses compare within a phase only."""
+        return 0 if self.target is None else min(int(progress * len(self.blurs)), len(self.blurs) - 1)
+
+    def __call__(self, env: TorchEnv, reward: Tensor, progress: float) -> Tensor:
+        """Loss (B,) of the environment after a step with rewards (B,)."""
+        if self.target is None:
+            return -reward
+        blur = self.blurs[self.phase(progress)]
+        difference = soft_silhouette(env.soft_observation()) - self.target
+        return (blur @ difference @ blur.T).abs().mean((1, 2))
+
+
+def matches_shape(spec: TaskSpec) -> bool:
+    """Whether the reward of a task is the overlap with its target."""
+    return spec.target is not None and spec.reward_fn is overlap
+
+
+def gaussian_matrix(sigma: float, size: int) -> Tensor:
+    """Gaussian blur along one axis as a matrix (size, size), float64, with zeros beyond the borders."""
+    if sigma == 0:
+        return torch.eye(size, dtype=torch.float64)
+    offset = torch.arange(-4 * size, 4 * size + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (offset / sigma) ** 2)
+    distance = torch.arange(size)[:, None] - torch.arange(size)
+    return weight[4 * size + distance] / weight.sum()
+
+
 class Episode(NamedTuple):
     """Result of one iteration."""
 
@@ -119,7 +154,7 @@ class Episode(NamedTuple):
     gradient: Tensor  # of the loss in theta, (T, 2, R, R)
 
 
-class Gradient(Stateful, OpenLoopAlgorithm):
+class Gradient(Resumable, OpenLoopLearner):
     """Adam on the actions of a whole episode, through the simulation.
 
     Actions are ``tanh(theta)``; theta (T, 2, R, R) starts at zero. Steps after the end of an episode do not count. An
@@ -139,7 +174,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         self.env.reset(seed=config.seed)
         if not matches_shape(self.env.spec):
             check_differentiable(self.env)
-        self.initial = self.env.save()  # with reference parity, another reset would keep the last episode's end
+        self.initial = self.env.save()
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)
         if start is not None:
@@ -239,9 +274,16 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             state["exp_avg"].zero_()
 
     @property
-    def policy(self) -> OpenLoop:
+    def trained_policy(self) -> OpenLoop:
         """The present actions; those of the second stage name their layout."""
         return OpenLoop(self.theta.tanh(), {"layout": self.config.seed} if self.stage > 1 else {})
+
+    @classmethod
+    def create(cls, config: GradientConfig, stage: int, folder: Path) -> "Gradient":
+        """The optimiser at the beginning of a stage; the second one begins with the actions of the first."""
+        learner = cls(config, stage, OpenLoop.load(policy_path(folder, stage - 1)) if stage > 1 else None)
+        learner.starts_trained = stage > 1
+        return learner
 
     @staticmethod
     def preset(task: str, name: str) -> GradientConfig:
@@ -253,17 +295,16 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         environment = sac_preset(task, name).environment
         quick, horizon = name == "quick", make_spec(task).horizon
         config = GradientConfig(
+            **vars(EnvironmentConfig(num_envs=1, particles="full") if quick else environment),
             task=task,
             preset="quick" if quick else "paper",
-            environment=EnvironmentConfig(num_envs=1, particles="full") if quick else environment,
-            report=ReportConfig(
-                eval_every=50 * horizon,
-                eval_episodes=3,
-                eval_deterministic=True,
-                checkpoint_every=10 * horizon,
-                log_every=horizon,
-            ),
+            eval_every=50 * horizon,
+            eval_episodes=3,
+            eval_deterministic=True,
+            checkpoint_every=10 * horizon,
+            log_every=horizon,
             train_particles="lite" if quick else "full",
+            train_dt=long_dt(task),
         )
         return config if task == "shapematch" else replace(config, iterations=30, grid="coarse", window=16)
 

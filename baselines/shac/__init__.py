@@ -1,1 +1,0 @@
-"""Short-horizon actor-critic (SHAC; Xu et al., ICLR 2022)."""

@@ -1,1 +1,0 @@
-"""Open-loop optimisation of a whole sequence of actions by gradients."""

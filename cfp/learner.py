@@ -1,0 +1,363 @@
+"""What a run needs of a learner beside stable-baselines3's interface, and the stages of the coarse-to-fine policy."""
+
+from __future__ import annotations
+
+import copy
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
+from torch import Tensor, nn
+
+from cfp.agent.actor import Actor, SmallEncoder
+from cfp.config import RunConfig, StagedConfig
+from cfp.envs.vec_env import TorchVecEnv
+from cfp.errors import ConfigError
+from cfp.experiment.folder import policy_path, start_path
+from cfp.experiment.process import StopSignals
+from cfp.policy import (
+    KIND,
+    ActorPolicy,
+    Policy,
+    copy_policy,
+    load,
+    policy_for,
+    read_policy,
+    report_mismatch,
+    write_policy,
+)
+from dittogym import TorchEnv
+
+#: What a policy may look at: the observation; the full state; the simulator, to plan with; nothing.
+Sees = Literal["image", "state", "simulator", "nothing"]
+#: Values to log by name; None for those that do not exist yet.
+Scalars = Mapping[str, float | None]
+#: Fraction of the learning rate that is left at the end of a stage.
+FINAL_FRACTION = 0.1
+
+
+class Learner(ABC):
+    """Learns one stage of a run; a stable-baselines3 algorithm, or a planner with the same ``learn``.
+
+    The class methods concern the whole run. `create` makes the object for a stage, whose ``learn`` takes the callbacks
+    of the run: they act when a rollout begins and at the end, and may raise to stop.
+    """
+
+    sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
+    presets: ClassVar[tuple[str, ...]] = ("quick", "paper")
+    keeps_best: ClassVar[bool] = True  # the policy of a run is that of the best evaluation, otherwise the newest
+    config: Any  # options of the run, a RunConfig
+    stage: int = 1  # in training, 1 is the first
+    num_timesteps: int = 0  # environment steps taken in this stage
+    starts_trained: bool = False  # with a policy that is then evaluated before the first step
+    replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
+    #: Takes at least so many environment steps and learns from them, see stable-baselines3's ``learn``.
+    learn: Callable[..., Any]
+
+    @property
+    def logger(self) -> Logger:
+        """Where scalars go."""
+        raise NotImplementedError
+
+    @staticmethod
+    @abstractmethod
+    def preset(task: str, name: str) -> RunConfig:
+        """Default options for a ``task``; the ``name`` of a preset is one of `presets`."""
+
+    @classmethod
+    def begin(cls, config: Any, folder: Path) -> tuple[int, int]:
+        """Put what a new run needs into its ``folder``; returns its first stage and the steps that this one skips."""
+        return 1, 0
+
+    @classmethod  # noqa: B027  (most learners need nothing)
+    def prepare(cls, config: Any, folder: Path, signals: StopSignals) -> None:
+        """Do what precedes the first stage, such as training a teacher; ``signals`` tell whether to stop."""
+
+    @classmethod
+    @abstractmethod
+    def create(cls, config: Any, stage: int, folder: Path) -> Learner:
+        """The learner at the beginning of a stage, also where a checkpoint is loaded into it later."""
+
+    @classmethod
+    def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
+        """One line for each stage, from ``first_stage`` on, that will not train as one may expect."""
+        return []
+
+    @classmethod
+    @abstractmethod
+    def load_policy(cls, path: Path, device: str = "cpu") -> Policy:
+        """Load the policy that `save_policy` wrote to ``path``, onto a device."""
+
+    @abstractmethod
+    def set_logger(self, logger: Logger) -> None:
+        """Set where scalars go."""
+
+    @property
+    def steps_without_change(self) -> int:
+        """Environment steps at the beginning of the stage in which its policy is not trained yet."""
+        return 0
+
+    def log_row(self) -> None:  # noqa: B027
+        """Record what belongs into the row of the logs that is being written, beside what was recorded already."""
+
+    def images(self) -> dict[str, np.ndarray]:
+        """What to show at an evaluation, uint8 (H, W, 3) by name."""
+        return {}
+
+    @property
+    @abstractmethod
+    def trained_policy(self) -> Policy:
+        """What has been learned so far, as `save_policy` writes it."""
+
+    @abstractmethod
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the policy and its ``description`` as a ``.safetensors`` file, see `cfp.files.write_policy`."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """All that learning needs to continue besides `num_timesteps` and `replay_buffer`: tensors and plain values."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the ``state`` of `state_dict`, in a learner made with the same options."""
+
+
+class NetworksPolicy(BasePolicy):
+    """The networks of an `UpdateLoop`, as the policy that stable-baselines3 saves and that ``predict`` acts by.
+
+    Args:
+        observation_space: Of the environment.
+        action_space: Of the environment.
+        actor: Maps observations (B, ...) to actions, without noise if its second argument is True.
+        networks: All others, by name.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        actor: nn.Module,
+        **networks: nn.Module,
+    ) -> None:
+        super().__init__(observation_space, cast(spaces.Box, action_space), normalize_images=False)
+        self.actor = actor
+        for name, network in networks.items():
+            self.add_module(name, network)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        action: Tensor = self.actor(observation, deterministic)
+        return action
+
+
+class UpdateLoop(BaseAlgorithm):
+    """A stable-baselines3 algorithm that is neither off-policy nor on-policy: `update` both simulates and learns.
+
+    Subclasses make simulation and networks in ``_setup_model``, and call `after_step` after each control step of all
+    robots, in `update`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"NetworksPolicy": NetworksPolicy}
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: Any,
+        config: Any = None,
+        stage: int = 1,
+        device: str | torch.device = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        rate = 0.0 if config is None else config.learning_rate
+        super().__init__(
+            policy, env, rate, device=device, support_multi_env=True, supported_action_spaces=(spaces.Box,)
+        )
+        self.config, self.stage = config, stage
+        self.progress = 0.0
+        if _init_setup_model:
+            self._setup_model()
+
+    @property
+    def simulation(self) -> TorchEnv:
+        """The environment in torch, for gradients."""
+        assert self.env is not None
+        simulation: TorchEnv = cast(TorchVecEnv, self.env.unwrapped).torch_env
+        return simulation
+
+    def begin_episodes(self) -> None:
+        """Start new episodes in all elements of the simulation."""
+        raise NotImplementedError
+
+    def update(self) -> bool:
+        """Simulate some control steps and learn from them; False if a callback stops the training."""
+        raise NotImplementedError
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> UpdateLoop:
+        """Take at least ``total_timesteps`` environment steps, see stable-baselines3; rows are logged by update."""
+        total, self._callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if reset_num_timesteps:
+            self.begin_episodes()  # `_setup_learn` has reset the environment
+        self._callback.on_training_start(locals(), globals())
+        updates = 0
+        while self.num_timesteps < total:
+            self._callback.on_rollout_start()
+            self.progress = min(self.num_timesteps / self.config.stage_steps(self.stage), 1.0)
+            if not self.update():
+                break
+            updates += 1
+            if log_interval is not None and updates % log_interval == 0:
+                self.log_row()
+                self.logger.dump(self.num_timesteps)
+        self._callback.on_training_end()
+        return self
+
+    def log_row(self) -> None:
+        """Record what belongs into a row of the logs beside the scalars of `update`."""
+
+    def after_step(self, done: Tensor, infos: list[dict[str, Any]]) -> bool:
+        """Count a control step of all robots and tell the callbacks; False if one stops the training."""
+        self.num_timesteps += len(done)
+        self._callback.update_locals({"dones": done.cpu().numpy(), "infos": infos})
+        return self._callback.on_step()
+
+    def record(self, scalars: Scalars) -> None:
+        """Record values for the next row of the logs."""
+        for name, value in scalars.items():
+            self.logger.record(name, value)
+
+
+class CoarseToFine(Learner):
+    """Learns the coarse-to-fine policy, each stage over the frozen policy of the coarser one (paper, Section 4.2)."""
+
+    config: StagedConfig
+
+    @classmethod
+    def begin(cls, config: Any, folder: Path) -> tuple[int, int]:
+        """Take the first stages from a policy if the options say so; its steps count as those before its handover."""
+        if config.start_from is None:
+            return 1, 0
+        policy, refine = policy_for(config, config.start_from), config.refine
+        stages, resolutions = len(policy.spec.resolutions), config.resolutions
+        if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
+            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
+            raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
+        if policy.spec.encoder != config.encoder:
+            raise ConfigError(f"start_from must be a policy with encoder {config.encoder}, got {policy.spec.encoder}")
+        if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
+            raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
+        stage = stages if refine else stages + 1
+        copy_policy(config.start_from, start_path(folder) if refine else policy_path(folder, stages))
+        return stage, (0, *config.ends())[stage - 1]
+
+    @classmethod
+    def load_policy(cls, path: Path, device: str = "cpu") -> ActorPolicy:
+        """Load a policy."""
+        return load(path, device)
+
+    @property
+    @abstractmethod
+    def trained_actor(self) -> Actor:
+        """The actor that is the policy."""
+
+    @property
+    def trained_policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        return ActorPolicy(self.config.actor_spec(self.stage), self.config.eval_deterministic, self.trained_actor)
+
+    @classmethod
+    def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
+        """Copy into a new ``actor`` the trained weights that its stage starts from; False if there are none."""
+        device = str(next(actor.parameters()).device)
+        if refines(config, folder, stage):
+            actor.load_state_dict(load(start_path(folder), device).actor.state_dict())
+        elif stage > 1:
+            path = policy_path(folder, stage - 1)
+            with report_mismatch(path):
+                copy_coarse_weights(actor, load(path, device).actor)
+        else:
+            return False
+        return True
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor with its frozen coarser stages."""
+        own = {"kind": KIND, "trained_by": self.config.algo, "network": asdict(self.config.actor_spec(self.stage))}
+        write_policy(path, self.trained_actor.state_dict(), description | own)
+
+
+def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
+    """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
+    actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
+    if isinstance(actor.encoder, SmallEncoder):  # heads and critics start from trained features
+        actor.encoder.load_state_dict(coarse.encoder.state_dict())
+
+
+def refines(config: Any, folder: Path, stage: int) -> bool:
+    """Whether the actor of a stage begins as the one that is refined."""
+    start = start_path(folder)
+    return config.refine and start.exists() and bool(read_policy(start)[1]["stage"] == stage)
+
+
+def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
+    """Factor that falls from 1 to ``final`` along a line as ``progress`` goes from 0 to 1."""
+    return 1.0 - (1.0 - final) * progress
+
+
+class Resumable:
+    """Saves and restores attributes by name: ``parts`` that have a state of their own, and plain ``values``."""
+
+    parts: ClassVar[tuple[str, ...]] = ()
+    values: ClassVar[tuple[str, ...]] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next step depends on; tensors on the CPU."""
+        state = {name: getattr(self, name).state_dict() for name in self.parts}
+        return state | {name: _plain(getattr(self, name)) for name in self.values}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict` in an object made with the same options."""
+        for name in self.parts:
+            getattr(self, name).load_state_dict(state[name])
+        for name in self.values:
+            value, present = state[name], getattr(self, name)
+            if isinstance(present, torch.Generator):
+                present.set_state(value)
+            elif isinstance(present, Tensor) and present.requires_grad:  # an optimiser holds it
+                present.data.copy_(value)
+            else:
+                setattr(self, name, value.to(present) if isinstance(present, Tensor) else copy.copy(value))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, torch.Generator):
+        return value.get_state()
+    return value.detach().cpu() if isinstance(value, Tensor) else copy.copy(value)
+
+
+def compress(images: Tensor) -> Tensor:
+    """Bytes (n,) of uint8 images, which take about a thirtieth of the memory; on the CPU."""
+    return torch.frombuffer(bytearray(zlib.compress(images.cpu().numpy().tobytes(), 1)), dtype=torch.uint8)
+
+
+def decompress(content: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The images (N, *shape) that `compress` was given."""
+    return torch.frombuffer(bytearray(zlib.decompress(content.numpy().tobytes())), dtype=torch.uint8).view(-1, *shape)

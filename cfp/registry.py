@@ -1,0 +1,72 @@
+"""All algorithms by name; their modules are imported when they are used. ``import baselines`` adds the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from cfp.config import RunConfig, update_from_dict
+from cfp.errors import ConfigError
+from cfp.learner import Learner
+from cfp.policy import KIND, Policy, policy_file, read_policy
+from cfp.presets import DEFAULT_TASK, default_algo, like_start
+
+#: ``"module:Class"`` of each algorithm, a subclass of `cfp.learner.Learner`.
+ALGORITHMS: dict[str, str] = {
+    "cfp-analytic": "cfp.analytic.learner:CFPAnalytic",
+    "cfp-sac": "cfp.sac.learner:CFPSAC",
+}
+#: Makes the error for a name that is no algorithm but something else; `baselines` knows policies that are not trained.
+EXPLANATIONS: list[Callable[[str], ConfigError | None]] = []
+
+
+def find(name: str) -> type[Learner]:
+    """The class of an algorithm; a `ConfigError` if there is none of that name."""
+    if name not in ALGORITHMS:
+        for explain in EXPLANATIONS:
+            if (error := explain(name)) is not None:
+                raise error
+        raise ConfigError(f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+    module, _, attribute = ALGORITHMS[name].partition(":")
+    algorithm: type[Learner] = getattr(import_module(module), attribute)
+    return algorithm
+
+
+def configure(values: dict[str, Any]) -> RunConfig:
+    """Options from JSON values; those that are left out come from the preset that the values name.
+
+    Raises:
+        ConfigError: There is no such algorithm, task, preset or option, or a value is of another type.
+    """
+    preset = values.get("preset", "quick")
+    algo, task = values.get("algo", default_algo(preset)), values.get("task", DEFAULT_TASK)
+    learner = find(str(algo))
+    if preset not in learner.presets:
+        raise ConfigError(f"preset must be {' or '.join(learner.presets)} for {algo}, got {preset!r}")
+    return update_from_dict(like_start(learner.preset(task, preset), values), values)
+
+
+def load(path: str | Path, device: str = "cpu") -> Policy:
+    """Load a trained policy of any algorithm; nothing is unpickled.
+
+    Args:
+        path: As in `cfp.load`: a run folder, a ``.safetensors`` file, ``"hf://OWNER/NAME"``, ...
+        device: Where its tensors go.
+
+    Returns:
+        A policy with stable-baselines3's ``predict``. Some have a memory, and expect the second result back as
+        ``state``. Its ``description`` tells task and origin.
+
+    Raises:
+        CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        ConfigError: It is of an algorithm that is not known here.
+    """
+    file = policy_file(path)
+    return find(algo_of(read_policy(file)[1])).load_policy(file, device)
+
+
+def algo_of(description: Mapping[str, Any]) -> str:
+    """Name of an algorithm whose policies are of the same kind as one with a description."""
+    return "cfp-sac" if description["kind"] == KIND else str(description["kind"])
