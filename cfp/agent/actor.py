@@ -174,22 +174,41 @@ class Encoder(nn.Module):
 
     def forward(self, *images: Tensor) -> Tensor:
         """Encode images (B, c, size, size) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
-        # The first layer is linear in its channels, so that it is evaluated for each image and for the coordinates
-        # separately: no constants are stacked with the images, and images that need no gradient get none.
-        *weights, position = self.first.weight.split([*(image.shape[1] for image in images), 2], dim=1)
-        bias, stride = self.first.bias, self.first.stride[0]
-        assert bias is not None
-        coordinates = torch.addmm(bias, self.patches, position.flatten(1).T).flatten()
-        hidden, *others = (
-            (_folded_conv if image.requires_grad else F.conv2d)(_channels_last(image), weight, stride=stride)
-            for image, weight in zip(images, weights, strict=True)
-        )
-        # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
-        hidden += coordinates.expand(len(hidden), -1).unflatten(1, (15, 15, -1)).movedim(-1, 1)
-        for other in others:
-            hidden += other
-        latent: Tensor = self.rest(hidden)
-        return latent
+        return encode([self], *images)
+
+
+def encode(encoders: Sequence[Encoder], *images: Tensor) -> Tensor:
+    """Evaluate n encoders of the same shape on the same images (B, c, size, size); returns latents (B, n w, 4, 4).
+
+    One convolution a layer, with the channels of all encoders, is faster on a CPU than several small ones. The first
+    layer is linear in its channels, so that it is evaluated for each image and for the coordinates separately: no
+    constants are stacked with the images, and images that need no gradient get none.
+    """
+    sizes, stride = [image.shape[1] for image in images], encoders[0].first.stride[0]
+    weight, bias = _joined([encoder.first for encoder in encoders])
+    *weights, position = weight.split([*sizes, 2], dim=1)
+    coordinates = torch.addmm(bias, encoders[0].patches, position.flatten(1).T).flatten()
+    hidden, *others = (
+        (_folded_conv if image.requires_grad else F.conv2d)(_channels_last(image), part, stride=stride)
+        for image, part in zip(images, weights, strict=True)
+    )
+    # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
+    hidden += coordinates.expand(len(hidden), -1).unflatten(1, (15, 15, -1)).movedim(-1, 1)
+    for other in others:
+        hidden += other
+    for layers in zip(*(encoder.rest for encoder in encoders), strict=True):
+        if isinstance(layers[0], nn.Conv2d):
+            hidden = F.conv2d(hidden, *_joined(layers), stride=layers[0].stride, groups=len(encoders))
+        else:
+            hidden = layers[0](hidden)
+    return hidden
+
+
+def _joined(layers: Sequence[Any], dim: int = 0) -> tuple[Tensor, Tensor]:
+    """Weights and biases of layers of the same shape, weights concatenated along ``dim``."""
+    if len(layers) == 1:
+        return layers[0].weight, layers[0].bias
+    return torch.cat([layer.weight for layer in layers], dim), torch.cat([layer.bias for layer in layers])
 
 
 def _folded_conv(image: Tensor, weight: Tensor, stride: int) -> Tensor:
@@ -242,21 +261,18 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
     """
     if not isinstance(heads[0][0], nn.ConvTranspose2d):
         return [head(latent) for head in heads]
-    values = _channels_last(latent)
-    layers: tuple[Any, ...]
-    for number, layers in enumerate(zip(*heads, strict=True)):
-        first = layers[0]
-        if isinstance(first, nn.ELU):
-            values = first(values)
+    first, *rest = zip(*heads, strict=True)
+    values = F.conv_transpose2d(_channels_last(latent), *_joined(first, 1), first[0].stride, first[0].padding)
+    for layers in rest:
+        if isinstance(layers[0], nn.ELU):
+            values = layers[0](values)
             continue
-        weights = [layer.weight for layer in layers]
-        if number:  # each head continues with its own channels
-            blocks = torch.block_diag(*(weight.flatten(1) for weight in weights))
-            weight = blocks.unflatten(1, (-1, *weights[0].shape[2:]))
-        else:
-            weight = torch.cat(weights, dim=1)
+        blocks = torch.block_diag(
+            *(layer.weight.flatten(1) for layer in layers)
+        )  # each continues with its own channels
+        weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
         bias = torch.cat([layer.bias for layer in layers])
-        values = F.conv_transpose2d(values, weight, bias, first.stride, first.padding)
+        values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
     return [part.contiguous() for part in values.chunk(len(heads), dim=1)]
 
 

@@ -17,6 +17,7 @@ from cfp.agent.actor import (
     Encoded,
     Interpolation,
     PairEncoder,
+    encode,
     initialise,
     normalise_image,
     perceptron,
@@ -49,7 +50,10 @@ class TwinCritic(nn.Module):
         image = normalise_image(observation)
         patch = upsample(action.reshape(-1, 2, self.resolution, self.resolution), IMAGE_SIZE, self.interpolation)
         critics = cast(list[Critic], list(self.critics))
-        latents = torch.stack([critic.encoder(image, patch) for critic in critics])
+        encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
+        inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
+        parts = [encode(pair, *seen).unflatten(1, (2, -1)) for pair, seen in zip(encoders, inputs, strict=True)]
+        latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
         return _values([critic.value for critic in critics], latents)
 
 
