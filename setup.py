@@ -19,7 +19,7 @@ from setuptools.command.build_ext import build_ext
 compiler = runpy.run_path("torchmpm/native/cpu/compiler.py")
 KERNELS = {
     "torchmpm/native/cpu/native.cpp": [[option] for option in compiler["REAL"].values()],
-    "dittogym/observation/native/picture.cpp": [["-ffp-contract=off"]],
+    "dittogym/picture.cpp": [["-ffp-contract=off"]],
 }
 
 

@@ -11,11 +11,10 @@ PROGRAMS = {
     "evaluate": ("baselines.evaluate", "returns of a trained policy, with films and recorded trajectories"),
     "replay": ("baselines.replay", "an episode of a policy, to watch in a browser"),
     "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
-    "play": ("dittogym.play.__main__", "play with a robot on a page in the browser"),
+    "play": ("baselines.play", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
     "leaderboard": ("baselines.leaderboard.__main__", "check and rank submissions of policies under a fixed protocol"),
     "distill": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
-    "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
 }
 EXAMPLES = """Examples:
   torchmpm train --task run --out runs/run

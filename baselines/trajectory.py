@@ -20,7 +20,7 @@ from cfp.presets import sac_preset
 from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv, make_spec
 from dittogym.action import bicubic
-from dittogym.observation.image import soft_silhouette
+from dittogym.observation import soft_silhouette
 from dittogym.spec import TaskSpec
 from dittogym.tasks.shapematch import reward_fn as overlap
 

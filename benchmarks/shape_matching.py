@@ -17,7 +17,7 @@ import baselines
 from baselines.train import main as train
 from cfp.config import EVALUATION_SEED
 from dittogym import TorchEnv
-from dittogym.observation.image import silhouette
+from dittogym.observation import silhouette
 from dittogym.tasks.targets import load_target
 
 LAYOUTS = 3

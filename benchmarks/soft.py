@@ -9,7 +9,7 @@ import torch
 from fidelity import wave, zeros
 
 import dittogym
-from dittogym.observation.image import silhouette, soft_silhouette
+from dittogym.observation import silhouette, soft_silhouette
 
 STEPS = 30
 

@@ -16,7 +16,7 @@ from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import brief, check_at_least, check_decay, check_fraction, check_positive
 from dittogym import make_spec
-from dittogym.action import ActionIndexing
+from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import task_name
 
@@ -48,7 +48,7 @@ class EnvironmentConfig:
     """Precision of the physics."""
     backend: str = "auto"
     """Backend of the physics: auto, eager, ..."""
-    action_layout: ActionIndexing = "image"
+    action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
     """Draw the particles anew at every reset; only with soft actor-critic."""
@@ -214,7 +214,7 @@ class StagedConfig(RunConfig):
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
-    """full (the paper's), or lean (half the size and width; actions join its features)."""
+    """paper (the paper's), or small (half the size and width; actions join its features)."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
     @property

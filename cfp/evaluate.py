@@ -23,8 +23,7 @@ from cfp.experiment.folder import policy_files, read_config
 from cfp.files import check_output
 from cfp.policy import Policy, environment_of, is_of_another_task, policy_file, shipped
 from cfp.validation import check_at_least
-from dittogym.trajectories import Episode, save_episodes
-from dittogym.trajectories.episode import record_batch
+from dittogym.trajectories import Episode, record, save_episodes
 
 EXAMPLES = (
     "runs/run --episodes 10 --video run.mp4",
@@ -174,7 +173,7 @@ def run(command: Command) -> str:
 def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode]:
     """The episodes of a policy that were evaluated, played again."""
     deterministic, first = without_noise(policy, command.noise), evaluation_seed(config)
-    recorder, seeds = partial(record_batch, fields=command.record_fields), range(first, first + command.episodes)
+    recorder, seeds = partial(record, fields=command.record_fields), range(first, first + command.episodes)
     return [record_episode(config, policy, deterministic, seed, recorder) for seed in seeds]
 
 

@@ -305,7 +305,7 @@ class CoarseToFine(Learner):
 
 
 def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
-    """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
+    """Copy a trained coarse actor into the new stage above it, and its small encoder too."""
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
     if isinstance(actor.encoder, SmallEncoder):  # heads and critics start from trained features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())

@@ -30,11 +30,11 @@ from cfp.files import write_atomically, write_json
 from cfp.hub import SCHEME, Shareable, download
 from cfp.validation import brief
 from dittogym import make_spec
-from dittogym.action import trained_indexing
-from dittogym.arguments import find_device
+from dittogym.action import trained_layout
 from dittogym.geometry import NODES
-from dittogym.observation.image import SHAPE
+from dittogym.observation import SHAPE
 from dittogym.tasks import fingerprint
+from dittogym.torch_env import find_device
 
 # Arguments of `predict` in stable-baselines3.
 Observation: TypeAlias = np.ndarray | dict[str, np.ndarray]
@@ -389,7 +389,7 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     """Load the policy that a run starts from, which must be for its task, physics and orientation of actions."""
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    if (found := trained_indexing(policy)) != (expected := config.action_layout):
+    if (found := trained_layout(policy)) != (expected := config.action_layout):
         raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
 

@@ -19,7 +19,7 @@ from cfp.files import parse_json
 from cfp.hub import Shareable
 from cfp.policy import Policy
 from cfp.tables import read_table
-from dittogym.render.recording import Recording, check_film_options
+from dittogym.render.recording import Recording, check_film
 
 
 class Run:
@@ -71,7 +71,7 @@ class Run:
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
             options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
         """
-        check_film_options(path, options)  # before the episode
+        check_film(path, options)  # before the episode
         recording = record_policy(self.config, self.policy)
         if path is not None:
             recording.save(path, **options)

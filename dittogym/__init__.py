@@ -4,9 +4,9 @@ Importing this package registers the Gymnasium ids ``dittogym/{task}-{coarse|fin
 task.
 """
 
-from dittogym.contract import Outcome
 from dittogym.env import Env
 from dittogym.registration import register
+from dittogym.rewards import Reward, Transition
 from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS, make_spec
 from dittogym.torch_env import TorchEnv
@@ -15,4 +15,4 @@ from dittogym.vector import BatchEnv
 for _task, _make in list(TASKS.items()):
     register(_task, _make)
 
-__all__ = ["TASKS", "BatchEnv", "Env", "Outcome", "TaskSpec", "TorchEnv", "make_spec", "register"]
+__all__ = ["TASKS", "BatchEnv", "Env", "Reward", "TaskSpec", "TorchEnv", "Transition", "make_spec", "register"]

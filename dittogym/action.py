@@ -9,36 +9,32 @@ from torch.nn.functional import interpolate, pad
 
 from torchmpm.tree import cached_tensors, transforming
 
-#: How an action array is indexed: as the observation (row from the top, column), or as the grid (x, y).
-ActionIndexing = Literal["image", "grid"]
+#: How an action array is laid out: as the observation (row from the top, column), or as the grid (x, y).
+ActionLayout = Literal["image", "grid"]
 
 
-def default_indexing(parity: str) -> ActionIndexing:
-    """How actions are indexed unless ``action_layout`` says otherwise."""
-    return "grid" if parity == "reference" else "image"
-
-
-def to_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
-    """Bring an action (B, 2, R, R) to the index order (component, x rightwards, y upwards).
+def to_grid_layout(action: Tensor, layout: ActionLayout) -> Tensor:
+    """Bring an action (B, 2, R, R) to the layout (component, x rightwards, y upwards).
 
     With ``"image"`` a pixel of the action acts where the same pixel of the observation looks; the reference
-    implementation indexes actions as ``"grid"``.
+    implementation has ``"grid"``.
     """
-    return action.flip(-2).transpose(-1, -2) if indexing == "image" else action
+    return action.flip(-2).transpose(-1, -2) if layout == "image" else action
 
 
-def from_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
-    """Undo :func:`to_grid_indexing`, for an action (..., R, R) indexed (x rightwards, y upwards)."""
-    return action.transpose(-1, -2).flip(-2) if indexing == "image" else action
+def from_grid_layout(action: Tensor, layout: ActionLayout) -> Tensor:
+    """Undo :func:`to_grid_layout`, for an action (..., R, R) laid out (x rightwards, y upwards)."""
+    return action.transpose(-1, -2).flip(-2) if layout == "image" else action
 
 
-def trained_indexing(policy: Any) -> ActionIndexing | None:
-    """How a trained policy, such as :func:`cfp.load` returns it, indexes its actions; ``None`` if it does not say."""
+def trained_layout(policy: Any) -> ActionLayout | None:
+    """The layout of a trained policy's actions, such as :func:`cfp.load` returns it; ``None`` if it does not say."""
     description = getattr(policy, "description", None)
     trained_in = description.get("environment") if isinstance(description, Mapping) else None
     if trained_in is None:
         return None
-    return trained_in.get("action_layout") or default_indexing(trained_in.get("parity", "clean"))
+    # Policies of earlier versions may say "parity": "reference" instead, which had the layout of the reference.
+    return trained_in.get("action_layout") or ("grid" if trained_in.get("parity") == "reference" else "image")
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:

@@ -1,28 +1,142 @@
-"""An environment as pure functions: :func:`reset` and :func:`step`, and the pieces they are composed of."""
+"""An environment as pure functions: :func:`reset` and :func:`step` of a :class:`Model` and a :class:`EnvState`."""
 
 from __future__ import annotations
 
-import math
+import functools
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dittogym.action import patch_field, place
-from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_outcome, kind_of, measure
-from dittogym.model import EnvState, Model
-from dittogym.physics import NAMES, Physics
-from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
-from dittogym.window import centre_in_window, contains
-from torchmpm import ParticleState, diagnostics, tree
-from torchmpm.rollout import Reads, changed, versions
-from torchmpm.tree import cached_tensors, transforming
+from dittogym.geometry import GRID, centre_in_window, contains
+from dittogym.observation import Camera
+from dittogym.physics import NAMES, Physics, bodies_of
+from dittogym.rewards import EXACT, SMOOTH, Features, Reward, RewardOps, TaskState, Transition, action_cost, features_of
+from dittogym.spec import DT, TaskSpec
+from torchmpm import ParticleState, Solver, diagnostics, tree
+from torchmpm.rollout import Segment
+from torchmpm.stability import check_gravity, stable_dt
+from torchmpm.tree import cached_tensors
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
 FAILURE_REWARD = -16.0
+#: Terms that the environment adds to those of a task.
+RESERVED_TERMS = frozenset({"split", "action", "alive", "failure"})
+#: What the environment puts into ``info``, and what Gymnasium does.
+RESERVED_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
+RESERVED_INFO |= {"episode", "final_obs", "final_info"}
+
+
+@tree.register
+@dataclass(frozen=True, eq=False)
+class EnvState:
+    """The complete state of B episodes, a pytree of tensors with leading dimension B.
+
+    Attributes:
+        particles: The matter.
+        origin: (B, 2) lower left corner of the window in the world, m.
+        centre: (B, 2) the robot's centre on which the next action is placed, m.
+        start: Averages right after the reset.
+        task_state: What the task remembers.
+        physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
+        steps: (B,) int64 control steps taken.
+    """
+
+    particles: ParticleState
+    origin: Tensor
+    centre: Tensor
+    start: Features
+    task_state: TaskState
+    physics: Physics
+    steps: Tensor
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, for pickles and deep copies, which cannot hold an autograd graph."""
+        tree.refuse_graph("the state of a TorchEnv", self)
+        return vars(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A task at a certain fidelity: its solver, camera and rewards, without state.
+
+    Attributes:
+        spec: The task.
+        solver: Its physics.
+        substeps: Substeps of a control step.
+        camera: Draws observations.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
+    """
+
+    spec: TaskSpec
+    solver: Solver
+    substeps: int
+    camera: Camera
+    segment: Segment = "auto"
+
+    @functools.cached_property
+    def num_robot_particles(self) -> int:
+        """The robot's particles come first."""
+        return self.solver.bodies[0].count
+
+    def solver_for(self, physics: Physics) -> Solver:
+        """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
+        if not physics:
+            return self.solver
+        bodies = bodies_of(self.spec, self.camera.counts, self.camera.particle_weight, physics)
+        return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
+
+
+def make_model(
+    spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, segment: Segment = "auto", dt: float = DT
+) -> Model:
+    """Build the physics of a task.
+
+    Args:
+        spec: The task.
+        counts: Particles of each body.
+        substeps: Substeps of a control step.
+        backend: Of the solver.
+        segment: See :class:`Model`.
+        dt: Duration of a substep, s.
+
+    Raises:
+        ValueError: The matter, its muscles or gravity need shorter substeps.
+    """
+    full = tuple(body.count for body in spec.bodies)
+    weight = tuple(n / m for n, m in zip(full, counts, strict=True))
+    solver = Solver(
+        GRID,
+        bodies_of(spec, counts, weight, {}),
+        gravity=spec.gravity,
+        damping=spec.damping ** (dt / DT),
+        rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules),
+        dt=dt,
+        backend=backend,
+        allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
+    )
+    native = backend in ("auto", "native")  # of the camera, which draws any matter
+    hidden = tuple(body.hidden_velocity for body in spec.bodies)
+    camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, counts == full, native)
+    model = Model(spec, solver, substeps, camera, segment)
+    check_stability(model, {})
+    return model
+
+
+def check_stability(model: Model, physics: Physics) -> None:
+    """Refuse matter that with its muscles needs shorter substeps, and gravity that does."""
+    solver = model.solver_for(physics)
+    actuation = physics.get("max_actuation", model.spec.max_actuation)
+    limit = solver.stable_dt(actuation)
+    if solver.dt > limit:
+        robot = stable_dt(solver.bodies[:1], GRID.h, actuation) == limit
+        matter = f"the material, muscles and mass of the {'robot' if robot else 'object'}"
+        raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
+    name = "physics['gravity']" if "gravity" in physics else "gravity"
+    check_gravity(name, solver.gravity, GRID.h, solver.dt)
 
 
 class StepResult(NamedTuple):
@@ -66,25 +180,27 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
         State and observation (B, 3, 64, 64) uint8.
 
     Raises:
-        ValueError: ``positions`` are of another shape or type, or ``physics`` holds an unknown name.
+        ValueError: ``positions`` are of another shape or type, ``physics`` holds an unknown name, or the task state has
+            another shape.
+        TypeError: The task state has no names.
     """
     shape = model.solver.num_particles, 2
     if not isinstance(positions, Tensor) or positions.ndim != 3 or positions.shape[1:] != shape:
-        raise ValueError(f"positions must be a tensor of shape (B, {shape[0]}, 2), got {kind_of(positions)}")
+        raise ValueError(f"positions must be a tensor of shape (B, {shape[0]}, 2), got {_kind(positions)}")
     if unknown := [name for name in physics or () if name not in NAMES]:
         raise ValueError(f"physics may hold {', '.join(NAMES)}, got {', '.join(unknown)}")
     spec, particles = model.spec, ParticleState.at_rest(positions)
-    start = measure(particles, model.num_robot_particles)
+    start = features_of(particles, model.num_robot_particles)
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
     state = EnvState(particles, spec.window.origin(start.com), start.com, start, {}, physics or {}, steps)
     observation = observe(model, state)
-    moment = _moment(model, state, start, observation, EXACT)
-    before = versions(moment._asdict())
-    memory = spec.initial_memory(moment, spec)
-    _refuse_changes(f"initial_memory of task {spec.name!r}", before)
-    check_memory(spec.name, memory, spec.stale_memory, len(positions))
+    task_state = spec.initial_task_state(_transition(model, state, start, observation, EXACT), spec)
+    who = f"initial_task_state of task {spec.name!r}"
+    if not isinstance(task_state, Mapping):
+        raise TypeError(f"{who} must return tensors by name, got {_kind(task_state)}")
+    _check_leading(who, "tensors", task_state, len(positions))
     # Of any kind of mapping, and a copy: it may hold what the state does.
-    return replace(state, memory=tree.map(Tensor.clone, dict(memory))), observation
+    return replace(state, task_state=tree.map(Tensor.clone, dict(task_state))), observation
 
 
 def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -> StepResult:
@@ -93,25 +209,26 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
     Args:
         model: The task.
         state: The present state.
-        action: (B, 2, R, R) in grid indexing, see :func:`dittogym.action.to_grid_indexing`, from -1 to 1. Elements with
+        action: (B, 2, R, R) in grid layout, see :func:`dittogym.action.to_grid_layout`, from -1 to 1. Elements with
             numbers that are not finite end with :data:`FAILURE_REWARD`.
         soft: Whether the reward is the smooth one, for gradients; all else is as without.
 
     Raises:
-        ValueError: ``action`` is of another shape or type, or the task returns what it must not.
+        ValueError: ``action`` is of another shape or type.
     """
-    return evaluate(model, *transition(model, state, action), soft=soft)
+    return evaluate(model, *advance(model, state, action), soft=soft)
 
 
-def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
+def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
     """Advance the physics by one control step.
 
-    Elements that are not finite afterwards have no gradient in what they came from, nor in the task's own constants.
+    Elements that are not finite afterwards pass no gradient to what they came from. Gradients of constants that all
+    elements share, such as a learned material of the task, are not finite then.
 
     Args:
         model: The task.
         state: The present state.
-        action: (B, 2, R, R) in grid indexing.
+        action: (B, 2, R, R) in grid layout.
 
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
@@ -119,45 +236,39 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     Raises:
         ValueError: ``action`` is of another shape or type.
     """
-    _check_action(model.spec.patch, action, state.particles.x)
+    spec, x = model.spec, state.particles.x
+    shape = action.shape if isinstance(action, Tensor) else ()
+    square = len(shape) == 4 and shape[2] == shape[3] <= spec.patch
+    if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
+        allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {spec.patch}"
+        raise ValueError(f"action must be {allowed}, got {_kind(action)}")
     finite: list[Tensor] = []  # where gradients may go back, known after the step
-
-    def guard(value: Tensor) -> Tensor:
-        """Stop gradients of what is not finite; NaN would spread through parameters that the batch shares."""
-        if value.requires_grad:
-            value = value.view_as(value)
-            value.register_hook(lambda g: None if g is None else tree.where(finite[0], g, torch.zeros_like(g)))
-        return value
-
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:
+        guard = functools.partial(_stop_gradients, finite=finite)
         state, action = tree.map(guard, tree.without_inference((state, action)))
-    spec, solver = model.spec, model.solver_for(state.physics)
-    actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
-    on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
-    advance = partial(solver.step, substeps=model.substeps, origin=state.origin, segment=model.segment)
-    particles = advance(state.particles, on_nodes)
-    learned = torch.is_grad_enabled() and any(value.requires_grad for value in model.solver.constants.values())
-    if guarded or learned:
+    physics = state.physics
+    solver = model.solver_for(physics)
+    actuation = patch_field(action, spec.patch, physics.get("max_actuation", spec.max_actuation))
+    centre = centre_in_window(spec.patch_centre, state.centre, state.origin)
+    on_nodes = place(actuation, centre, solver.grid.resolution)
+    particles = solver.step(
+        state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
+    )
+    if guarded:
         finite.append(diagnostics.finite(particles))
-    if learned and not transforming() and not bool(finite[0].all()):
-        # All elements share the task's own constants, so no hook can tell them apart there. Step once more without
-        # those that are not finite: particles with a NaN position take no part.
-        nowhere = tree.map(lambda tensor: torch.full_like(tensor, math.nan), state.particles)
-        again = advance(tree.where(finite[0], state.particles, nowhere), on_nodes)
-        particles = tree.where(finite[0], again, particles.detach())
     com = particles.x[:, : model.num_robot_particles].mean(1)
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), actuation
 
 
-def _check_action(patch: int, action: Tensor, x: Tensor) -> None:
-    shape = action.shape if isinstance(action, Tensor) else ()
-    square = len(shape) == 4 and shape[2] == shape[3] <= patch
-    if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
-        allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {patch}"
-        raise ValueError(f"action must be {allowed}, got {kind_of(action)}")
+def _stop_gradients(value: Tensor, finite: list[Tensor]) -> Tensor:
+    """Let no gradient of an element that is not finite pass: NaN would spread through parameters the batch shares."""
+    if value.requires_grad:
+        value = value.view_as(value)
+        value.register_hook(lambda g: None if g is None else tree.where(finite[0], g, torch.zeros_like(g)))
+    return value
 
 
 def observe(model: Model, state: EnvState) -> Tensor:
@@ -166,51 +277,47 @@ def observe(model: Model, state: EnvState) -> Tensor:
 
 
 def soft_observation(model: Model, state: EnvState) -> Tensor:
-    """The image as a smooth function of the state, see :meth:`dittogym.observation.camera.Camera.observe_smoothly`."""
+    """The image as a smooth function of the state, see :meth:`dittogym.observation.Camera.observe_smoothly`."""
     return model.camera.observe_smoothly(state.particles.x, state.particles.v, state.origin, state.centre)
 
 
 def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = False) -> StepResult:
-    """Observation, reward, termination and success after a transition.
+    """Observation, reward, termination and success of a state that :func:`advance` led to.
 
     Elements whose state is not valid, see :func:`is_valid`, end with the term ``failure`` = :data:`FAILURE_REWARD`.
 
     Args:
         model: The task.
-        state: After the transition.
+        state: After the step.
         actuation: (B, 2, P, P) on the patch, Pa.
         soft: As in :func:`step`.
     """
     spec, observation = model.spec, observe(model, state)
-    now = measure(state.particles, model.num_robot_particles)
-    info = measured_info(model, state, now)
+    now = features_of(state.particles, model.num_robot_particles)
+    info = info_of(model, state, now)
     valid = info["finite"]
-    moment = _moment(model, state, now, observation, EXACT)
-    outcome, terms, reward = _weighted_reward(model, moment, actuation, valid)
-    image, true_reward = None, reward
+    transition = _transition(model, state, now, observation, EXACT)
+    reward = spec.reward_fn(transition, spec)
+    terms, total = _weighted(spec, reward, transition, actuation, valid)
+    image, true_total = None, total
     if soft:
         image = soft_observation(model, state)
-        _, terms, reward = _weighted_reward(model, moment._replace(observation=image, ops=SMOOTH), actuation, valid)
-    terminated = ~valid if outcome.terminated is None else outcome.terminated | ~valid
+        transition = transition._replace(observation=image, ops=SMOOTH)
+        terms, total = _weighted(spec, spec.reward_fn(transition, spec), transition, actuation, valid)
+    terminated = ~valid if reward.terminated is None else reward.terminated | ~valid
     if spec.split_limit is not None:
-        terminated = terminated | (now.split > spec.split_limit)
-    if outcome.memory is not None:  # a copy: it may hold what info does
-        state = replace(state, memory=tree.map(Tensor.clone, dict(outcome.memory)))
-    success = None if outcome.success is None else outcome.success & valid
-    info |= outcome.info or {}
-    return StepResult(state, observation, reward, terms, terminated, success, info, true_reward, actuation, image)
+        terminated = terminated | (now.radius_of_gyration > spec.split_limit)
+    if reward.task_state is not None:  # a copy: it may hold what info does
+        state = replace(state, task_state=tree.map(Tensor.clone, dict(reward.task_state)))
+    success = None if reward.success is None else reward.success & valid
+    info |= reward.info or {}
+    return StepResult(state, observation, total, terms, terminated, success, info, true_total, actuation, image)
 
 
-def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:
+def info_of(model: Model, state: EnvState, now: Features) -> dict[str, Tensor]:
     """What ``info`` holds in every task, by name, of a state and its averages ``now``."""
-    info = {"com": now.com, "split": now.split, "finite": is_valid(model, state), "object_com": now.object_com}
-    return {name: value for name, value in info.items() if value is not None}
-
-
-def seen(model: Model, state: EnvState, observation: Tensor) -> tuple[EnvState, Tensor, dict[str, Tensor]]:
-    """A state without its physics, its observation, and its ``info``: what a reset replaces in some elements."""
-    now = measure(state.particles, model.num_robot_particles)
-    return replace(state, physics={}), observation, measured_info(model, state, now)
+    info = {"com": now.com, "split": now.radius_of_gyration, "finite": is_valid(model, state)}
+    return info if now.object_com is None else {**info, "object_com": now.object_com}
 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:
@@ -219,42 +326,27 @@ def is_valid(model: Model, state: EnvState) -> Tensor:
     return diagnostics.finite(state.particles) & contains(robot, state.origin.detach()).any(1)
 
 
-def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, ops: RewardOps) -> Moment:
-    memory = dict(state.memory)  # so that a task cannot exchange the entries of the state
-    return Moment(state.particles, model.num_robot_particles, now, state.start, observation, memory, ops)
+def _transition(model: Model, state: EnvState, now: Features, observation: Tensor, ops: RewardOps) -> Transition:
+    robot, start, task_state = model.num_robot_particles, state.start, state.task_state
+    return Transition(state.particles, robot, now, start, observation, task_state, ops)
 
 
-def _weighted_reward(
-    model: Model, moment: Moment, actuation: Tensor, valid: Tensor
-) -> tuple[Outcome, dict[str, Tensor], Tensor]:
-    """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
-    spec, now = model.spec, moment.now
-    before = versions(moment._asdict())
-    outcome = spec.reward_fn(moment, spec)
-    _refuse_changes(f"reward_fn of task {spec.name!r}", before)
-    check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
-    terms, weights = dict(outcome.terms), spec.weights
+def _weighted(
+    spec: TaskSpec, reward: Reward, transition: Transition, actuation: Tensor, valid: Tensor
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
+    terms, weights, radius = dict(reward.terms), spec.weights, transition.now.radius_of_gyration
     if spec.split_limit is not None:
-        terms["split"] = moment.ops.split_penalty(now.split, spec.split_limit)
+        terms["split"] = transition.ops.split_penalty(radius, spec.split_limit)
     if weights.get("action"):
         terms["action"] = -action_cost(actuation)
-    terms["alive"] = torch.ones_like(now.split)
-    terms["failure"] = torch.zeros_like(now.split)
-    factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), now.split.dtype, now.split.device)
+    terms["alive"] = torch.ones_like(radius)
+    terms["failure"] = torch.zeros_like(radius)
+    factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), radius.dtype, radius.device)
     values = torch.stack(tuple(terms.values())).to(factors) * factors
-    counted = torch.where(valid, values, failed)
-    first, *others = counted.unbind()
-    reward = sum(others, first)  # in an order that does not depend on the size of the batch, as that of Tensor.sum does
-    # Seldom, so that the names are not looked for in every step. Nothing can depend on numbers under torch.func.vmap.
-    if not transforming() and not math.isfinite(reward.detach().sum()):
-        _check_finite(spec.name, list(terms), values, valid)
-    return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
-
-
-def _refuse_changes(who: str, before: Reads) -> None:
-    """Refuse changes in place of the moment whose versions were noted."""
-    if names := changed(before):
-        raise ValueError(f"{who} must not change its moment in place, but it changed {', '.join(names)}")
+    counted = torch.where(valid, values, failed).unbind()
+    # In an order that does not depend on the size of the batch, as that of Tensor.sum does.
+    return dict(zip(terms, counted, strict=True)), sum(counted[1:], counted[0])
 
 
 @cached_tensors
@@ -266,10 +358,59 @@ def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.devic
     return factors, failed
 
 
-def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) -> None:
-    """Refuse terms (K, B) that are not finite where the simulations (B,) are valid."""
-    wrong = ~torch.isfinite(values.detach()) & valid
-    if bool(wrong.any()):
-        term, element = wrong.nonzero()[0].tolist()
-        found = f"{values[term, element].item()} for {names[term]!r} in simulation {element}"
-        raise ValueError(f"reward_fn of task {task!r} must return finite terms in finite simulations, got {found}")
+@torch.no_grad()
+def check_rewards(model: Model, positions: Tensor) -> None:
+    """Call a task's functions once, right after a reset, and refuse what they must not return.
+
+    Args:
+        model: The task.
+        positions: (B, N, 2), m. With two simulations, numbers for one alone are found as well.
+
+    Raises:
+        TypeError: ``reward_fn`` returns no :class:`dittogym.rewards.Reward`, or something without names.
+        ValueError: A name or a shape is not allowed, or ``spec.weights`` do not fit the terms.
+    """
+    spec, batch = model.spec, len(positions)
+    state, observation = reset(model, positions)
+    transition = _transition(model, state, state.start, observation, EXACT)
+    reward, who = spec.reward_fn(transition, spec), f"reward_fn of task {spec.name!r}"
+    if not isinstance(reward, Reward):
+        raise TypeError(f"{who} must return a Reward, got {type(reward).__name__}")
+    for what, values in (("terms", reward.terms), ("info", reward.info), ("task_state", reward.task_state)):
+        if not isinstance(values, Mapping) and (values is not None or what == "terms"):
+            raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
+    info, weights = reward.info or {}, spec.weights
+    for part, taken in (("terms", RESERVED_TERMS & reward.terms.keys()), ("info", RESERVED_INFO & info.keys())):
+        if taken:
+            raise ValueError(f"{who} must not return the environment's own {part}, got {sorted(taken)}")
+    for name in (*reward.terms, *info):  # Gymnasium puts a mask _name beside every entry of a batch's info
+        if not isinstance(name, str) or name.startswith(("_", "reward_terms/")):
+            raise ValueError(f"{who} must return names that do not begin with _ or reward_terms/, got {name!r}")
+    if missing := [name for name in reward.terms if name not in weights]:
+        raise ValueError(f"weights of task {spec.name!r} must hold every term of reward_fn, got none for {missing}")
+    weighted = {*reward.terms, *RESERVED_TERMS} - {"failure"}  # the penalty of a failure has its own amount
+    if unknown := sorted(weights.keys() - weighted):
+        raise ValueError(f"weights of task {spec.name!r} must be of the terms {sorted(weighted)}, got {unknown}")
+    for name, value in reward.terms.items():
+        if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
+            found = f"{_kind(value)} for {name!r}"
+            raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {found}")
+    for name, flag in (("terminated", reward.terminated), ("success", reward.success)):
+        if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
+            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")
+    _check_leading(who, "info", info, batch)
+    if reward.task_state is not None:
+        before, after = ({n: _kind(v) for n, v in each.items()} for each in (state.task_state, reward.task_state))
+        if before != after:
+            raise ValueError(f"{who} must return task_state like initial_task_state, {before}, got {after}")
+
+
+def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:
+    for name, value in values.items():
+        if not isinstance(value, Tensor) or value.shape[:1] != (batch,):
+            raise ValueError(f"{who} must return {what} of shape (B, ...), got {_kind(value)} for {name!r}")
+
+
+def _kind(value: object) -> str:
+    """Type and shape of a tensor, type of anything else, for messages."""
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__

@@ -13,10 +13,10 @@ from gymnasium.envs.registration import EnvSpec
 
 from dittogym.bodies.json_values import to_values
 from dittogym.bodies.positions import MAX_SEED
-from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import check_size, describe
+from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv

@@ -1,4 +1,4 @@
-"""Obstacles: one list of boxes feeds physics (velocity rules), observation and picture."""
+"""The world of a task: the simulated window of 1 m x 1 m, and obstacles, whose boxes feed physics and observation."""
 
 from __future__ import annotations
 
@@ -6,15 +6,70 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
 from numbers import Real
+from typing import TypeAlias
 
-from dittogym.observation.image import RASTER
-from torchmpm import VelocityRule, checks
+import torch
+from torch import Tensor
+
+from torchmpm import Grid, VelocityRule, checks
 from torchmpm.boundary import Range, limits
 
 #: Nodes per metre of every DittoGym window.
 NODES = 128
+#: The grid of every task.
+GRID = Grid(NODES)
+#: Centre (x, y), 0 to 1 m from the lower left corner of the window; ``None`` stands for the robot's centre.
+Centre: TypeAlias = tuple[float | None, float | None]
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where the window lies in the world.
+
+    Attributes:
+        left: The left end of a fixed window, m.
+        follow: Of a moving window, the distance of the robot's centre from its left end, m.
+
+    Raises:
+        ValueError: Both are given.
+    """
+
+    left: float = 0.0
+    follow: float | None = None
+
+    def __post_init__(self) -> None:
+        checks.number("left", self.left)
+        if self.follow is not None:
+            checks.number("follow", self.follow)
+            if self.left:
+                raise ValueError(f"left must not be given with follow, got {self.left} and {self.follow}")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the window follows the robot."""
+        return self.follow is not None
+
+    def origin(self, com: Tensor) -> Tensor:
+        """Lower left corner (B, 2) of the window for robots centred on ``com`` (B, 2), m."""
+        left = torch.full_like(com[:, 0], self.left) if self.follow is None else com[:, 0] - self.follow
+        return torch.stack((left, torch.zeros_like(left)), dim=1)
+
+
+def contains(x: Tensor, origin: Tensor) -> Tensor:
+    """Which of the points ``x`` (B, N, 2) lie in the windows at ``origin`` (B, 2): (B, N) bool; false for NaN."""
+    height = x[..., 1] - origin[:, 1:2]
+    return GRID.contains(x[..., 0], origin[:, 0:1]) & (height > 0) & (height < 1)
+
+
+def centre_in_window(centre: Centre, robot: Tensor, origin: Tensor) -> Tensor:
+    """A centre in window coordinates."""
+    relative = robot - origin
+    if centre == (None, None):
+        return relative
+    columns = [relative[:, i] if c is None else torch.full_like(relative[:, i], c) for i, c in enumerate(centre)]
+    return torch.stack(columns, dim=1)
 
 
 @dataclass(frozen=True)
@@ -39,12 +94,6 @@ class Box:
 def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: float = inf, closed: bool = False) -> Box:
     """A box whose bounds are counted in nodes from the world's origin."""
     return Box(left / NODES, right / NODES, bottom / NODES, top / NODES, closed)
-
-
-def goal_box(point: tuple[float, float]) -> Box:
-    """What the observation shows of a goal: fine pixels less than ten away in both directions."""
-    (x, y), half = point, 10 / RASTER
-    return Box(x - half, x + half, y - half, y + half)
 
 
 @dataclass(frozen=True)

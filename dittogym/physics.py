@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dittogym.spec import TaskSpec
-from torchmpm import tree
+from torchmpm import Body, Elastic, VonMises, tree
 
 #: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -80,7 +80,7 @@ def check_effect(spec: TaskSpec, physics: Physics) -> None:
             raise ValueError(f"physics may not hold {name!r} in {spec.name}, whose bodies have their own materials")
         if name in ("mu", "lam") and spec.robot.material is not None:
             alone = f"physics[{name!r}] changes the object of {spec.name} alone, not the robot with its own material"
-            warnings.warn(alone, stacklevel=4)  # where TorchEnv.reset is called
+            warnings.warn(alone, stacklevel=3)  # where TorchEnv.reset is called
     if physics.keys() & {"mu", "lam"}:
         own = defaults(spec, next(iter(physics.values())))
         mu, lam = _broadcast_pair(*(physics.get(name, own[name]).detach() for name in ("mu", "lam")))
@@ -121,7 +121,30 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
     return {name: tree.where(mask, *_broadcast_pair(*pair)) for name, pair in pairs.items()}
 
 
-def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
+def bodies_of(
+    spec: TaskSpec, counts: tuple[int, ...], particle_weight: tuple[float, ...], physics: Physics
+) -> tuple[Body, ...]:
+    """Robot and objects as the solver has them.
+
+    Args:
+        spec: The task.
+        counts: Particles of each body.
+        particle_weight: By body, the full-size particles that one particle stands for: a factor on mass and volume, so
+            that density and stiffness mean the same for every particle count.
+        physics: Constants in place of the task's own.
+    """
+    values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
+    bodies: list[Body] = []
+    for body, count, weight in zip(spec.bodies, counts, particle_weight, strict=True):
+        first, robot = sum(earlier.count for earlier in bodies), not bodies
+        own = {name: _part_of(value, slice(first, first + count)) for name, value in values.items()}
+        default = VonMises(own["mu"], own["lam"], own["yield_stress"]) if robot else Elastic(own["mu"], own["lam"])
+        material = default if body.material is None else body.material
+        bodies.append(Body(count, material, weight * body.mass * own["mass"], weight, muscle=robot))
+    return tuple(bodies)
+
+
+def _part_of(value: float | Tensor, particles: slice) -> float | Tensor:
     """The part of a value that belongs to some of the particles."""
     return value[:, particles] if isinstance(value, Tensor) and value.ndim == 2 else value
 

@@ -11,12 +11,13 @@ import gymnasium
 
 from dittogym.env import Env
 from dittogym.spec import TaskSpec
-from dittogym.tasks import TASKS, make_spec, task_name
+from dittogym.tasks import TASKS, make_spec
 from dittogym.torch_env import TorchEnv
 from dittogym.vector import BatchEnv
 from torchmpm import checks
 
-ENTRY_POINT = "dittogym.env:Env"
+#: The tasks of the library, whose names stay theirs.
+LIBRARY = dict(TASKS)
 _SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 #: Arguments that environments keep to themselves.
 TAKEN = {name for taker in (TorchEnv, Env, BatchEnv, make_spec) for name in inspect.signature(taker).parameters}
@@ -25,17 +26,18 @@ TAKEN = {name for taker in (TorchEnv, Env, BatchEnv, make_spec) for name in insp
 def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
     """Register a task by name for :class:`dittogym.TorchEnv` and, in both resolutions, for Gymnasium.
 
+    A name that is registered again, as in a notebook's cell that is run twice, stands for the later function.
+
     Args:
         task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
             Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` too.
         namespace: Namespace of the ids.
-        version: Increase it with every change of behaviour. If a function is defined again, as in a notebook, the ids
-            of the old one are removed.
+        version: Increase it with every change of behaviour.
 
     Raises:
-        ValueError: The name belongs to another function, differs from that in the specification or is not one word, an
-            argument of ``make`` is one of the environments too, or the version is not a whole number.
+        ValueError: The name is that of a task of the library, differs from that in the specification or is not one
+            word, an argument of ``make`` is one of the environments too, or the version is not a whole number.
         TypeError: ``make`` is not a function without required arguments that returns a :class:`dittogym.TaskSpec`.
 
     Examples:
@@ -51,6 +53,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     if not isinstance(namespace, str) or re.fullmatch(r"[\w-]+", namespace) is None:
         raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
     version = checks.whole("version", version, 0)
+    if LIBRARY.get(task, make) is not make:
+        raise ValueError(f"task must be a name that no task of the library has, got {task!r}")
     if not callable(make):
         raise TypeError(f"make must be a function that returns a TaskSpec, got {type(make).__name__}")
     own = {name: each for name, each in inspect.signature(make).parameters.items() if each.kind not in _SEVERAL}
@@ -61,21 +65,14 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
-    if _source(TASKS.get(task, make)) != _source(make):  # of local functions many have the same name
-        raise ValueError(f"task must be a new name, got {task!r}, which is taken")
     if spec.name != task:
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
-    if TASKS.get(task, make) is not make:
-        for known in list(gymnasium.registry.values()):
-            its_task = known.kwargs.get("task")
-            if known.entry_point == ENTRY_POINT and isinstance(its_task, str) and task_name(its_task) == task:
-                del gymnasium.registry[known.id]
     for resolution in ("coarse", "fine"):
         name = f"{namespace}/{task}-{resolution}-v{version}"
         gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that are replaced
         gymnasium.register(
             id=name,
-            entry_point=ENTRY_POINT,
+            entry_point="dittogym.env:Env",
             vector_entry_point="dittogym.vector:BatchEnv",
             max_episode_steps=spec.horizon,
             kwargs={"task": _address(task, make), "resolution": resolution},
@@ -89,9 +86,3 @@ def _address(task: str, make: Callable[..., TaskSpec]) -> str:
     name = getattr(module, "__name__", "")
     importable = name.isidentifier() and name != "__main__" and getattr(module, "__file__", None) is not None
     return f"{name}:{task}" if importable else task
-
-
-def _source(make: Callable[..., TaskSpec]) -> object:
-    """Where a function was defined, which stays the same if a notebook's cell defines it again."""
-    name = getattr(make, "__qualname__", "<")
-    return make if "<" in name else (make.__module__, name)

@@ -9,10 +9,9 @@ from typing import TypeAlias
 import numpy as np
 
 from dittogym.bodies.shapes import Shape
-from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import NODES, Box, Obstacle, goal_box
-from dittogym.observation.image import SIZE
-from dittogym.window import Centre, Window
+from dittogym.geometry import NODES, Box, Centre, Obstacle, Window
+from dittogym.observation import SIZE, goal_box
+from dittogym.rewards import Reward, TaskState, Transition
 from torchmpm import Material, checks
 
 #: Duration of a control step, s.
@@ -51,8 +50,8 @@ class BodySpec:
         checks.flag("hidden_velocity", self.hidden_velocity)
 
 
-def no_memory(moment: Moment, spec: TaskSpec) -> Memory:
-    """The memory of a task that needs none."""
+def no_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
+    """The state of a task that remembers nothing."""
     return {}
 
 
@@ -68,8 +67,8 @@ class TaskSpec:
         lam: First Lame parameter, Pa.
         yield_stress: Of the robot, Pa.
         max_actuation: Muscle stress at action 1, Pa.
-        reward_fn: The task's own reward terms, termination and success, from a :class:`dittogym.contract.Moment` and
-            this specification. Operations of ``moment.ops`` give the reward a smooth form.
+        reward_fn: The task's own reward terms, termination and success, from a :class:`dittogym.rewards.Transition`
+            and this specification. Operations of ``transition.ops`` give the reward a smooth form.
         weights: Weights of the reward terms of ``reward_fn`` by name, and any of ``split`` (a torn robot, where there
             is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every step).
         objects: Bodies besides the robot, at most one.
@@ -78,14 +77,14 @@ class TaskSpec:
         window: Fixed or moving window.
         view: Centre (x, y) of the observed region, half a metre wide, in the window, m; ``None`` for a coordinate that
             follows the robot.
-        reach: Centre (x, y) of the action patch, in the same form.
+        patch_centre: Centre (x, y) of the action patch, in the same form.
         patch: Width of the action patch in nodes.
         obstacles: Static geometry, in order of precedence.
         goal: Point (x, y) in the world, m, drawn in the observation as a square 2 cm wide; ``None``: no goal.
         coarse, fine: Action resolutions.
-        split_limit: Spread at which the episode ends, m; ``None``: it never does.
-        initial_memory: What to remember from the start of an episode, tensors with a leading B.
-        stale_memory: Entries of the memory that a reset leaves as they are with ``parity="reference"``.
+        split_limit: The robot's radius of gyration at which it counts as torn and the episode ends, m; ``None``: it
+            never does.
+        initial_task_state: What to remember from the start of an episode, tensors with a leading B.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
 
     Raises:
@@ -107,21 +106,20 @@ class TaskSpec:
     damping: float = 1.0
     window: Window = Window()  # noqa: RUF009
     view: Centre = (None, None)
-    reach: Centre = (None, None)
+    patch_centre: Centre = (None, None)
     patch: int = 64
     obstacles: tuple[Obstacle, ...] = ()
     goal: tuple[float, float] | None = None
     coarse: int = 8
     fine: int = 16
     split_limit: float | None = None
-    initial_memory: MemoryFunction = no_memory
-    stale_memory: tuple[str, ...] = ()
+    initial_task_state: TaskStateFunction = no_task_state
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for name, kind in (("name", str), ("robot", BodySpec), ("window", Window), ("weights", Mapping)):
             checks.instance(name, getattr(self, name), kind)
-        for name, each in (("objects", BodySpec), ("obstacles", Obstacle), ("stale_memory", str)):
+        for name, each in (("objects", BodySpec), ("obstacles", Obstacle)):
             checks.instances(name, given := getattr(self, name), each)
             object.__setattr__(self, name, tuple(given))  # later changes of the caller's do not reach it
         self._check_numbers()
@@ -133,9 +131,9 @@ class TaskSpec:
             if self.target.dtype != bool or self.target.shape != (SIZE, SIZE):
                 found = f"{self.target.dtype} of shape {self.target.shape}"
                 raise ValueError(f"target must be bool of shape {(SIZE, SIZE)}, got {found}")
-        for name in ("reward_fn", "initial_memory"):
+        for name in ("reward_fn", "initial_task_state"):
             if not callable(given := getattr(self, name)):
-                raise TypeError(f"{name} must be a function of a Moment and a TaskSpec, got {given!r}")
+                raise TypeError(f"{name} must be a function of a Transition and a TaskSpec, got {given!r}")
 
     def _check_numbers(self) -> None:
         for name, value in self.weights.items():
@@ -156,7 +154,7 @@ class TaskSpec:
             if (given := getattr(self, name)) is not None or name == "gravity":
                 checks.pair(name, given)
                 object.__setattr__(self, name, tuple(map(float, given)))
-        for name in ("view", "reach"):
+        for name in ("view", "patch_centre"):
             centre: Centre = getattr(self, name)
             if not isinstance(centre, tuple | list):
                 raise TypeError(f"{name} must be two numbers, or None for each that follows the robot, got {centre!r}")
@@ -177,5 +175,5 @@ class TaskSpec:
         return boxes if self.goal is None else (*boxes, goal_box(self.goal))
 
 
-RewardFunction: TypeAlias = Callable[[Moment, TaskSpec], Outcome]
-MemoryFunction: TypeAlias = Callable[[Moment, TaskSpec], Memory]
+RewardFunction: TypeAlias = Callable[[Transition, TaskSpec], Reward]
+TaskStateFunction: TypeAlias = Callable[[Transition, TaskSpec], TaskState]

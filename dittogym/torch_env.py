@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym import arguments, core
-from dittogym.action import ActionIndexing, default_indexing, to_grid_indexing
+from dittogym import core
+from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
-from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, make_model, next_physics
-from dittogym.observation.image import SHAPE
-from dittogym.physics import Physics, merged
+from dittogym.core import EnvState, make_model
+from dittogym.observation import SHAPE
+from dittogym.physics import Physics, check_effect, merged, physics_values
 from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import QUANTITIES, Shot, describe, take
-from dittogym.spec import DT, TaskSpec
+from dittogym.rewards import features_of
+from dittogym.snapshots import Snapshot, check_snapshot, constants_of, kind_of
+from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
 from torchmpm.rollout import Segment, check_repetition
+from torchmpm.tree import transforming
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+#: Substeps in a control step, far above any use.
+MOST_SUBSTEPS = 1_000_000
+RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
 class TorchEnv:
@@ -45,10 +56,7 @@ class TorchEnv:
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
         action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
-            ``"grid"``: (x, y), as in the reference implementation. ``None``: as ``parity`` has it.
-        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation, action centre and
-            ``TaskSpec.stale_memory`` after a reset, and at every particle count its random positions, unit particle
-            volume and pixel raster.
+            ``"grid"``: (x, y), as in the reference implementation. ``None`` stands for ``"image"``.
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Refuse what does not repeat bit by bit: CUDA, and the backend ``"compile"``.
         segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
@@ -56,8 +64,8 @@ class TorchEnv:
             :func:`dittogym.make_spec`.
 
     Raises:
-        ValueError: An argument is out of range.
-        TypeError: The task has no such option.
+        ValueError: An argument is out of range, or the task's functions return what they must not.
+        TypeError: The task has no such option, or its functions return something of another kind.
 
     Examples:
         >>> import dittogym, torch
@@ -86,33 +94,34 @@ class TorchEnv:
         dtype: str | torch.dtype = "float32",
         device: str | torch.device = "cpu",
         backend: str = "auto",
-        action_layout: ActionIndexing | None = None,
-        parity: Parity = "clean",
+        action_layout: ActionLayout | None = None,
         resample: bool = False,
         deterministic: bool = False,
         segment: Segment = "auto",
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
-        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), arguments.find_substeps(dt, substeps)
+        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
         check_repetition(substeps, segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
-        self.dtype = arguments.choice("dtype", str(dtype).removeprefix("torch."), arguments.DTYPES)
-        self.device = arguments.find_device(device)
+        if (name := str(dtype).removeprefix("torch.")) not in DTYPES:
+            raise ValueError(f"dtype must be one of {tuple(DTYPES)}, got {name!r}")
+        self.dtype, self.device = DTYPES[name], find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
             needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
             raise ValueError(f"{needs}, got {device!r} and {backend!r}")
-        self.action_resolution = arguments.find_resolution(self.spec, resolution)
+        self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._as_reference = arguments.choice("parity", parity, {"clean": False, "reference": True})
-        layouts = {"image": "image", "grid": "grid", None: default_indexing(parity)}
-        self.action_layout = arguments.choice("action_layout", action_layout, layouts)
+        if action_layout not in ("image", "grid", None):
+            raise ValueError(f"action_layout must be 'image', 'grid' or None, got {action_layout!r}")
+        self.action_layout: ActionLayout = action_layout or "image"
         counts = particle_counts(self.spec, particles)
-        self.model = make_model(self.spec, counts, substeps, backend, parity, segment, float(dt))
-        random = self.model.camera.pixels  # both as in the reference, with full counts or its parity
+        self.model = make_model(self.spec, counts, substeps, backend, segment, float(dt))
+        random = self.model.camera.pixels  # with full counts, both as in the reference
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
+        core.check_rewards(self.model, self._initial_positions.even(2, self._like))
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
@@ -140,15 +149,15 @@ class TorchEnv:
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
-        arguments.refuse_transforms("TorchEnv.env_state")
+        _refuse_transforms("TorchEnv.env_state")
         checks.instance("env_state", value, EnvState)
         theirs = value.particles
         kind = theirs.batch_size, theirs.num_particles, theirs.dtype, theirs.device
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        if self._env_state is not None and (missing := self._env_state.memory.keys() - value.memory.keys()):
-            raise ValueError(f"env_state must have the memory of this task, got none of {sorted(missing)}")
+        if self._env_state is not None and (missing := self._env_state.task_state.keys() - value.task_state.keys()):
+            raise ValueError(f"env_state must have the task state of this task, got none of {sorted(missing)}")
         self._env_state, self._actuation, self._observation = value, None, None
 
     @property
@@ -183,7 +192,11 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self.observation()))
-        return Snapshot(self.model.kind, state, observation, self.model.constants)
+        return Snapshot(kind_of(self.model), state, observation, self._constants)
+
+    @functools.cached_property
+    def _constants(self) -> dict[str, str]:
+        return constants_of(self.model)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Restore a snapshot; the simulation continues bit for bit as it did before.
@@ -202,8 +215,8 @@ class TorchEnv:
                 type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
-        chosen = arguments.find_mask("mask", mask, self.num_envs, self.device)
-        check_snapshot(self.model, snapshot, self._like)
+        chosen = find_mask("mask", mask, self.num_envs, self.device)
+        check_snapshot(snapshot, self.model, self._constants, self._like)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
@@ -239,30 +252,31 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
-        arguments.refuse_transforms("TorchEnv.reset")
-        options = arguments.reset_options(options)
-        mask = arguments.find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
+        _refuse_transforms("TorchEnv.reset")
+        options = reset_options(options)
+        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
             raise ValueError("reset_mask must reset all elements the first time")
-        given, present = options.get("physics"), self._physics
-        physics = present if given is None else next_physics(self.model, present, given, mask, self._like)
+        physics = self._physics
+        if (given := options.get("physics")) is not None:
+            values = physics_values(given, self.num_particles, self._like)
+            check_effect(self.spec, values)
+            physics = merged(self.spec, physics, values, mask, self._like)
+            core.check_stability(self.model, physics)
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
         # Indexing saves the index for the backward pass, which `detach(physics=False)` would make impossible to repeat.
         own = tree.map(lambda t: t[index], physics) if len(index) < self.num_envs else physics
         fresh, observation = core.reset(self.model, drawn.positions[index], own)
-        info = core.measured_info(self.model, fresh, fresh.start)
-        if self._env_state is not None:
-            if self._as_reference:  # its reset leaves the last episode's centre, memory and observation
-                old, observation = self._env_state, self.observation()[index]
-                memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
-                fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
-            if len(index) < self.num_envs:
-                kept = core.seen(self.model, self.env_state, self.observation())
-                others = replace(fresh, physics={}), observation, info
-                fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
-                fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))
+        info = core.info_of(self.model, fresh, fresh.start)
+        if len(index) < self.num_envs:
+            old = self.env_state
+            now = features_of(old.particles, self.model.num_robot_particles)
+            kept = replace(old, physics={}), self.observation(), core.info_of(self.model, old, now)
+            others = replace(fresh, physics={}), observation, info
+            fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
+            fresh = replace(fresh, physics=merged(self.spec, old.physics, physics, mask, self._like))
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
@@ -287,11 +301,15 @@ class TorchEnv:
             ValueError: The action has the wrong shape or type or is not finite.
             RuntimeError: It is called under a transform of ``torch.func`` or in a backward pass.
         """
-        arguments.refuse_transforms("TorchEnv.step")
-        arguments.refuse_backward("TorchEnv.step")
-        checks.flag("soft", soft)
-        action = arguments.check_action(action, (self.num_envs, *self.action_shape), self.dtype, self.device)
-        action = to_grid_indexing(action, self.action_layout)
+        _refuse_transforms("TorchEnv.step")
+        if torch._C._current_graph_task_id() != -1:
+            raise RuntimeError(
+                "TorchEnv.step must not be called in a backward pass, as torch.utils.checkpoint does to repeat a step "
+                "from the state after it: use dittogym.core.step with its model, which keeps nothing"
+            )
+        if not isinstance(soft, bool):
+            raise ValueError(f"soft must be True or False, got {soft!r}")
+        action = to_grid_layout(self._checked(action), self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
@@ -300,6 +318,25 @@ class TorchEnv:
         self._env_state, self._actuation = result.state, result.actuation.detach()
         observation = result.observation if result.soft_observation is None else result.soft_observation
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
+
+    def _checked(self, action: Tensor) -> Tensor:
+        """The action in the type and on the device of the simulations, if it is finite and of the right shape."""
+        if not isinstance(action, Tensor) or not action.is_floating_point():
+            kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
+            hint = "" if isinstance(action, Tensor) else "; torch.as_tensor(action) makes a tensor of an array"
+            raise ValueError(f"action must be a floating point tensor, got {kind}{hint}")
+        if action.layout is not torch.strided or action.is_meta:
+            raise ValueError(f"action must hold dense numbers, got a tensor of {action.layout} on {action.device}")
+        if tuple(action.shape) != (shape := (self.num_envs, *self.action_shape)):
+            raise ValueError(
+                f"action must have shape {shape}, got {tuple(action.shape)}; the option resolution of the environment "
+                "sets its last two numbers"
+            )
+        action = action.to(self.device, self.dtype)
+        # A sum that is finite spares the test of every entry; one of finite entries may overflow.
+        if not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):
+            raise ValueError(f"action must be finite, got {wrong} entries that are NaN or infinite")
+        return action
 
     def soft_observation(self) -> Tensor:
         """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
@@ -347,3 +384,71 @@ class TorchEnv:
     def _repr_png_(self) -> bytes | None:
         """What a notebook shows: the first simulation, once there is a state."""
         return None if self._env_state is None else png(self.render())
+
+
+def find_resolution(spec: TaskSpec, resolution: str | int, name: str = "resolution") -> int:
+    """Action cells per axis; ``name`` is that of the argument."""
+    named = {"coarse": spec.coarse, "fine": spec.fine}
+    size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
+    if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= spec.patch:
+        raise ValueError(f"{name} must be 'coarse', 'fine' or 1 to {spec.patch}, got {resolution!r}")
+    return int(size)
+
+
+def find_substeps(dt: float, substeps: int | None) -> int:
+    """Substeps of ``dt`` s in a control step; ``None`` stands for as many as take :data:`CONTROL_STEP`."""
+    checks.number("dt", dt, above=0.0)
+    if substeps is not None:
+        return checks.whole("substeps", substeps, 1, MOST_SUBSTEPS)
+    ratio = CONTROL_STEP / dt
+    count = round(ratio) if ratio <= MOST_SUBSTEPS else 0
+    if not math.isclose(count * dt, CONTROL_STEP):
+        problem = f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}"
+        raise ValueError(f"{problem}; there may be at most {MOST_SUBSTEPS} substeps")
+    return count
+
+
+def find_mask(name: str, given: Any, num_envs: int, device: torch.device) -> Tensor:
+    """A mask of elements, (B,) bool; ``None`` stands for all."""
+    if given is None:
+        return torch.ones(num_envs, dtype=torch.bool, device=device)
+    try:
+        mask = torch.as_tensor(given, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        mask = None
+    if mask is None or mask.dtype != torch.bool or mask.shape != (num_envs,):
+        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {given!r}")
+    return mask
+
+
+def find_device(device: str | torch.device) -> torch.device:
+    """The device that the option ``device`` names."""
+    try:
+        found = torch.device(device)
+    except (TypeError, RuntimeError):
+        found = None
+    if found is None or found.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    count = torch.cuda.device_count() if found.type == "cuda" else 1
+    if (found.index or 0) >= count:
+        raise ValueError(f"device must be available, got {device!r}, but torch finds {count} of this kind")
+    return found
+
+
+def reset_options(options: Any) -> dict[str, Any]:
+    """The options of a reset; the allowed names are :data:`RESET_OPTIONS`."""
+    options = {} if options is None else options
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options must be a mapping that may hold {', '.join(RESET_OPTIONS)}, got {options!r}")
+    if unknown := options.keys() - set(RESET_OPTIONS):
+        raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {', '.join(map(repr, unknown))}")
+    return dict(options)
+
+
+def _refuse_transforms(name: str) -> None:
+    """Refuse to keep tensors that end with the transform of ``torch.func`` that they were made in."""
+    if transforming():
+        raise RuntimeError(
+            f"{name} must not be used under a transform of torch.func, whose tensors the environment would keep: use "
+            "dittogym.core.reset and dittogym.core.step with its model, which keep nothing"
+        )

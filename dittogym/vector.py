@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dittogym.bodies.positions import Seed
 from dittogym.env import RENDER_FPS, RENDER_MODES, JsonSpec, as_numpy, as_tensor, spaces
-from dittogym.model import Snapshot
 from dittogym.render.scene import check_size
+from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
@@ -148,7 +148,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         action = as_tensor(actions, self.torch_env)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            return self._reset_then_step(action)
+            return self._step_then_reset(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
         rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
         images, info = as_numpy(step.observation), as_numpy(step.info)
@@ -160,22 +160,19 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
         return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
 
-    def _reset_then_step(self, action: torch.Tensor) -> tuple[Any, ...]:
-        """A step in which elements that have ended before are reset instead in the mode ``NEXT_STEP``."""
+    def _step_then_reset(self, action: torch.Tensor) -> tuple[Any, ...]:
+        """A step after which, in the mode ``NEXT_STEP``, elements that had ended before it are reset."""
         fresh = self._ended.copy()
         ended = torch.as_tensor(fresh, device=action.device)
         action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
-        start: dict[str, Tensor] = {}
-        if fresh.any():  # from the step that ended them, which the reference's reset looks back to
-            _, start = self.torch_env.reset(options={"reset_mask": ended})
-            restarted = self.torch_env.save()
         observation, reward, terminated, _, raw = self.torch_env.step(action)
         limits = _array(self.torch_env.env_state.steps >= self._horizon) & ~fresh
         rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = ends | limits
+        start: dict[str, Tensor] = {}
         if fresh.any():
-            observation = self.torch_env.load(restarted, ended)
+            observation, start = self.torch_env.reset(options={"reset_mask": ended})
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def save(self) -> Snapshot:

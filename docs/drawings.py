@@ -13,7 +13,7 @@ import numpy as np
 from result_tables import markdown
 from task_pages import PAGES, write
 
-from dittogym.render.canvas import GROUND, TARGET
+from dittogym.render.frame import GROUND, TARGET
 from dittogym.tasks.targets import load_target
 
 #: Pixels per side of a shown picture.

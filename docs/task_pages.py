@@ -77,7 +77,7 @@ env.unwrapped.film(policy, "[[ spec.name ]].webp")
 ```
 
 ```bash
-python -m dittogym.play [[ spec.name ]] --policy [[ spec.name ]]   # in the browser
+python -m cfp.play [[ spec.name ]] --policy [[ spec.name ]]   # in the browser
 python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
 ```
 
@@ -202,7 +202,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
             else f"{window.follow:g} m behind the robot's centre",
         ),
         ("centre of the observed region", centre(spec.view)),
-        ("centre of the action patch", centre(spec.reach)),
+        ("centre of the action patch", centre(spec.patch_centre)),
         (
             "spread limit of the robot",
             "none" if spec.split_limit is None else f"{spec.split_limit:g} m",

@@ -23,6 +23,7 @@ pytestmark = [
         reason="needs a C++ compiler and a usual processor",
     ),
 ]
+#: Simulates, differentiates, writes a replay, and serves the page to play on.
 PROGRAM = """
 import torch, dittogym
 from torchmpm.native.cpu import library
@@ -31,6 +32,20 @@ env.reset(seed=0)
 actions = torch.full((1, *env.action_shape), 0.5, requires_grad=True)
 observation = env.step(actions)[0]
 env.state.x.std().backward()
+env.film(lambda seen: actions.detach(), "replay.html", max_steps=2)
+import functools, re, threading, urllib.request
+from cfp.play.server import Server
+from cfp.play.session import Session
+server = Server(functools.partial(Session, "run", particles=200), "token", 0)
+thread = threading.Thread(target=server.run)
+thread.start()
+root, _, query = server.address.partition("?")
+read = lambda name: urllib.request.urlopen(root + name).read().decode()
+for name in re.findall('page/[a-z.]+', read("?" + query)):
+    read(name)
+assert "class Scene" in read("page/scene.js") and read("page/scene.js") in open("replay.html").read()
+server.stop()
+thread.join()
 print(library.provenance())
 print(observation.sum().item(), actions.grad.abs().sum().item() > 0, library.build.cache_info().currsize)
 """
@@ -58,13 +73,14 @@ def test_source_distribution_is_complete(dist: Path) -> None:
 
 
 def test_wheel_runs_without_compiler(dist: Path, tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn")
     (wheel,) = dist.glob("*.whl")
     assert "-py3-none-" in wheel.name
     venv.create(tmp_path / "env", symlinks=True)
     packages = next((tmp_path / "env/lib").glob("*/site-packages"))
     zipfile.ZipFile(wheel).extractall(packages)
     (packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"])
-    environment = {"PATH": "", "HOME": str(tmp_path / "home"), "OMP_WAIT_POLICY": "PASSIVE"}
+    environment = {"PATH": "", "HOME": str(tmp_path / "home"), "OMP_WAIT_POLICY": "PASSIVE", "NO_PROXY": "127.0.0.1"}
     command = [str(tmp_path / "env/bin/python"), "-c", PROGRAM]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -8,7 +8,7 @@ from typing import Literal
 from cfp.config import Config, Particles, RunConfig
 from cfp.errors import ConfigError
 from dittogym import make_spec
-from dittogym.arguments import find_resolution
+from dittogym.torch_env import find_resolution
 
 #: Action grid R: coarse, fine (the task's), or a number.
 Grid = int | Literal["coarse", "fine"]

@@ -13,7 +13,7 @@ from cfp.evaluation.returns import UntrainedPolicy
 from cfp.policy import Policy
 from cfp.presets import sac_preset
 from dittogym import make_spec
-from dittogym.action import ActionIndexing, from_grid_indexing
+from dittogym.action import ActionLayout, from_grid_layout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {
 }
 
 
-def wave(steps: int, size: int, indexing: ActionIndexing) -> Tensor:
+def wave(steps: int, size: int, indexing: ActionLayout) -> Tensor:
     """The actions with which the reference figures of the tasks were recorded, (T, 2, R, R).
 
     In step t = 1, 2, ... the muscle of direction c in column x and row y of the action grid, counted to the right and
@@ -51,4 +51,4 @@ def wave(steps: int, size: int, indexing: ActionIndexing) -> Tensor:
     """
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)
-    return from_grid_indexing(torch.from_numpy(drive.astype(np.float32)), indexing)
+    return from_grid_layout(torch.from_numpy(drive.astype(np.float32)), indexing)

@@ -11,9 +11,8 @@ from torch import Tensor
 from cfp.analytic.reward import has_gradient
 from cfp.errors import ConfigError
 from dittogym import TorchEnv, core
-from dittogym.action import ActionIndexing, to_grid_indexing
-from dittogym.core import StepResult
-from dittogym.model import EnvState, Model
+from dittogym.action import ActionLayout, to_grid_layout
+from dittogym.core import EnvState, Model, StepResult
 from torchmpm import trajectory
 
 #: From the task, a state and actions (B, 2, R, R) in grid indexing, such as :func:`dittogym.core.step`.
@@ -53,7 +52,7 @@ def rollout(
     actions: Tensor,
     step: StepFunction = soft_step,
     *,
-    indexing: ActionIndexing = "image",
+    indexing: ActionLayout = "image",
     checkpointed: bool = True,
 ) -> Rollout:
     """Drive simulations through some control steps.
@@ -68,7 +67,7 @@ def rollout(
     """
 
     def advance(before: _Step, action: Tensor) -> _Step:
-        result = step(model, before.state, to_grid_indexing(action, indexing))
+        result = step(model, before.state, to_grid_layout(action, indexing))
         reward, true_reward = (
             torch.where(before.ended, 0.0, value) for value in (result.reward, result.true_reward.detach())
         )

@@ -121,7 +121,7 @@ class LocalExecutor(Executor):
             self._kill.set()
         self._pool.shutdown()
 
-    def _run(self, job: Job) -> Outcome:
+    def _run(self, job: Job) -> Reward:
         for attempt in range(1 + self.resources.retries):
             if self._stop.is_set():
                 return "stopped"
@@ -199,7 +199,7 @@ class RayExecutor(Executor):
             future.set_exception(unexpected)
 
 
-def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Outcome:
+def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Reward:
     """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
 
     The process is in a session of its own: Ctrl-C reaches this process only, which then asks it to stop, once.

@@ -45,7 +45,7 @@ def decode(line: str) -> tuple[Job, float]:
     return job, values["lock_timeout"]
 
 
-def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
+def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Reward:
     """Do what is left of a run; an error is written to ``error.txt`` in its folder."""
     try:
         with run_lock(job.folder, lock_timeout):

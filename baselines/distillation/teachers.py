@@ -25,7 +25,7 @@ from cfp.hub import is_address
 from cfp.learner import Resumable
 from cfp.policy import Policy, StatePolicy, check_trained_for, copy_policy, read_policy, shipped
 from dittogym import TorchEnv
-from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing, trained_indexing
+from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
 
 #: Teachers that are trained first if only their algorithm is named.
 TRAINED = ("shac", "gradient")
@@ -46,7 +46,7 @@ class Teacher(Resumable, ABC):
 class PolicyTeacher(Teacher):
     """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
-    def __init__(self, policy: Policy, indexing: ActionIndexing) -> None:
+    def __init__(self, policy: Policy, indexing: ActionLayout) -> None:
         self.policy, self.indexing = policy, indexing
         self._memory: tuple[np.ndarray, ...] | None = None
 
@@ -57,8 +57,8 @@ class PolicyTeacher(Teacher):
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
-        own = trained_indexing(self.policy) or self.indexing
-        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array, device=env.device), own), self.indexing)
+        own = trained_layout(self.policy) or self.indexing
+        return from_grid_layout(to_grid_layout(torch.as_tensor(array, device=env.device), own), self.indexing)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""

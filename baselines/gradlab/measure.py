@@ -12,7 +12,7 @@ from torch.nn.functional import cosine_similarity
 from tqdm import tqdm
 
 from baselines.common.rollout import rollout
-from dittogym.model import EnvState, Model
+from dittogym.core import EnvState, Model
 from torchmpm import tree
 
 #: Step sizes of the finite differences, root mean square per action value.

@@ -20,7 +20,7 @@ from cfp.files import write_json
 from cfp.hub import is_address
 from cfp.policy import Policy, check_trained_for, policy_file, shipped
 from cfp.sections import EnvironmentConfig
-from dittogym.action import trained_indexing
+from dittogym.action import trained_layout
 
 #: Name under which the policy of the package with a task's own name is submitted.
 PRETRAINED = "pretrained"
@@ -93,7 +93,7 @@ def _trained(protocol: FixedProtocol, path: str) -> Candidate:
         training=training,
         library=torchmpm.__version__,
     )
-    return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_indexing(policy)))
+    return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_layout(policy)))
 
 
 def _name(path: str, task: str) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor
 from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, visible_positions
 from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing
+from dittogym.action import from_grid_layout
 from dittogym.spec import TaskSpec
 from torchmpm import tree
 
@@ -82,7 +82,7 @@ class SegmentedEnv:
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance by one control step, see `dittogym.TorchEnv.step`, with actions (B, K, 2)."""
         field = self.nodes.to_grid(self.env, self.labels, action)
-        _, reward, terminated, truncated, info = self.env.step(from_grid_indexing(field, self.env.action_layout))
+        _, reward, terminated, truncated, info = self.env.step(from_grid_layout(field, self.env.action_layout))
         labels = update(visible_positions(self.env), self.labels, self.nodes.count)
         self.labels = tree.where(info["finite"], labels, self.labels)
         return self._observe(info["finite"]), reward, terminated, truncated, info

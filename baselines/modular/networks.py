@@ -21,7 +21,7 @@ from baselines.modular.nodes import Nodes, unpack, visible_positions
 from cfp.agent.actor import Sample, SquashedActor, initialise, perceptron, sample_squashed_gaussian
 from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing, trained_indexing
+from dittogym.action import from_grid_layout, trained_layout
 from dittogym.spec import TaskSpec
 
 Kind = Literal["gnn", "transformer"]
@@ -164,7 +164,7 @@ class SegmentPolicy(StateBasedPolicy):
         if self.change is not None:
             values = torch.from_numpy(self.change(values.cpu().numpy()))
         action = self.nodes.to_grid(env, labels, values.to(env.device))
-        return from_grid_indexing(action, trained_indexing(self) or env.action_layout), (labels.cpu().numpy(),)
+        return from_grid_layout(action, trained_layout(self) or env.action_layout), (labels.cpu().numpy(),)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""

@@ -9,9 +9,8 @@ from torch.nn.functional import pad
 from baselines.modular.kmeans import adjacency, segment_means, squared_distances
 from dittogym import TorchEnv
 from dittogym.action import patch_corner
-from dittogym.geometry import FLOOR_NODE, NODES
+from dittogym.geometry import FLOOR_NODE, NODES, centre_in_window
 from dittogym.spec import TaskSpec
-from dittogym.window import centre_in_window
 from torchmpm import checks
 
 #: Units of the features, m and m/s: most values lie within [-2, 2].
@@ -96,7 +95,7 @@ class Nodes:
         """
         size, state = env.spec.patch, env.env_state
         grid = env.model.solver.grid.resolution
-        corner = patch_corner(centre_in_window(env.spec.reach, state.centre, state.origin), size, grid)
+        corner = patch_corner(centre_in_window(env.spec.patch_centre, state.centre, state.origin), size, grid)
         index = torch.arange(size, device=env.device)
         indices = torch.stack(torch.meshgrid(index, index, indexing="ij"), -1).flatten(0, 1)
         position = state.origin[:, None] + (corner[:, None] + indices) / grid

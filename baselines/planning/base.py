@@ -15,9 +15,8 @@ from cfp.errors import ConfigError
 from cfp.learner import Resumable
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
-from dittogym.contract import measure
-from dittogym.core import StepResult
-from dittogym.model import EnvState, Model
+from dittogym.core import EnvState, Model, StepResult
+from dittogym.rewards import features_of
 from torchmpm import tree
 
 #: Fraction of the task's limit on the robot's spread from which a spread costs.
@@ -144,7 +143,7 @@ class Planner(Resumable, ABC, Generic[Config]):
         result, limit = self.step(model, state, action), model.spec.split_limit
         if limit is None:
             return result
-        split = measure(result.state.particles, model.num_robot_particles).split
+        split = features_of(result.state.particles, model.num_robot_particles).radius_of_gyration
         cost = split_cost(split, limit, SPLIT_MARGIN, self.config.split_weight)
         reward, true_reward = result.reward - cost, result.true_reward - cost.detach()
         return result._replace(reward=reward, true_reward=true_reward)

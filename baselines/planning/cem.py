@@ -12,7 +12,7 @@ from cfp.errors import ConfigError
 from cfp.validation import check_decay, check_positive
 from dittogym import core
 from dittogym.action import bicubic
-from dittogym.model import EnvState
+from dittogym.core import EnvState
 from torchmpm import tree
 
 

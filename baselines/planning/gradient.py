@@ -8,7 +8,7 @@ from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig, where_simulation
 from cfp.validation import check_positive
-from dittogym.model import EnvState
+from dittogym.core import EnvState
 
 
 @dataclass(frozen=True, kw_only=True)

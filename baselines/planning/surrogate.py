@@ -7,7 +7,7 @@ from torch import Tensor
 
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.model import EnvState
+from dittogym.core import EnvState
 from dittogym.physics import PER_PARTICLE
 from torchmpm import tree
 
@@ -26,10 +26,10 @@ class Surrogate:
         self.env = small
         self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
         same = large.model.camera.counts == small.model.camera.counts
-        memory = {} if same else small.env_state.memory
-        # Numbers of particles, such as those of the tip in GROW, see `dittogym.contract.Outcome`.
-        self._particle_memory = {
-            name: value for name, value in memory.items() if value.dtype == torch.int64 and value.ndim == 2
+        task_state = {} if same else small.env_state.task_state
+        # Numbers of particles, such as those of the tip in GROW, see `dittogym.rewards.Reward`.
+        self._particle_indices = {
+            name: value for name, value in task_state.items() if value.dtype == torch.int64 and value.ndim == 2
         }
 
     def sync(self, state: EnvState) -> None:
@@ -42,8 +42,9 @@ class Surrogate:
             name: select(value) if name in PER_PARTICLE and value.ndim == 2 else value
             for name, value in state.physics.items()
         }
-        memory = {**state.memory, **self._particle_memory}
-        self.env.env_state = replace(state, particles=tree.map(select, state.particles), physics=physics, memory=memory)
+        task_state = {**state.task_state, **self._particle_indices}
+        particles = tree.map(select, state.particles)
+        self.env.env_state = replace(state, particles=particles, physics=physics, task_state=task_state)
 
 
 def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:

@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from cfp.errors import ConfigError
 from dittogym.action import bicubic
 from dittogym.geometry import NODES
-from dittogym.observation.image import SIZE
+from dittogym.observation import SIZE
 
 Interpolation = Literal["half_pixel", "aligned"]
 EncoderKind = Literal["paper", "small"]

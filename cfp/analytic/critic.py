@@ -16,7 +16,7 @@ from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv
-from dittogym.window import centre_in_window
+from dittogym.geometry import centre_in_window
 from torchmpm.spline import quadratic_weights
 
 #: Width of the hidden layers.
@@ -73,7 +73,11 @@ class StateFeatures:
         """Positions (B, N, 2) in cells from the patch's lower left corner."""
         state, spec = env.env_state, env.spec
         width = spec.patch / env.model.solver.grid.resolution
-        centre = centre_in_window(spec.reach, state.centre, state.origin).detach().clamp(0.5 * width, 1.0 - 0.5 * width)
+        centre = (
+            centre_in_window(spec.patch_centre, state.centre, state.origin)
+            .detach()
+            .clamp(0.5 * width, 1.0 - 0.5 * width)
+        )
         corner = state.origin.detach() + centre - 0.5 * width
         return (state.particles.x - corner[:, None]) * (CELLS / width)
 

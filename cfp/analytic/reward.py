@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfp.config import WindowConfig
 from dittogym import TorchEnv, core
-from dittogym.contract import Moment, Outcome
+from dittogym.rewards import Reward, Transition
 from dittogym.spec import TaskSpec
 from torchmpm import tree
 
@@ -100,8 +100,8 @@ def has_gradient(env: TorchEnv) -> bool:
     """
     differentiable: list[bool] = []
 
-    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
-        outcome = env.spec.reward_fn(moment, spec)
+    def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
+        outcome = env.spec.reward_fn(transition, spec)
         differentiable.extend(term.requires_grad for term in outcome.terms.values())
         return outcome
 

@@ -11,7 +11,7 @@ from cfp.config import TASK_OPTIONS, RunConfig
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.arguments import find_device
+from dittogym.torch_env import find_device
 
 
 def choose_device(name: str) -> str:

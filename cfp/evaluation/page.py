@@ -22,11 +22,10 @@ from cfp.config import RunConfig, differences, to_json
 from cfp.evaluation.returns import Result, to_rows
 from cfp.files import write_atomically, write_text
 from cfp.tables import Table, columns, read_table
-from dittogym.observation.image import silhouette
-from dittogym.render.canvas import GROUND, TARGET
-from dittogym.render.colours import ROBOT
-from dittogym.render.frame import png
+from dittogym.observation import silhouette
+from dittogym.render.frame import GROUND, TARGET, png
 from dittogym.render.recording import Recording
+from dittogym.render.scene import ROBOT
 
 #: Pictures of every evaluation (TensorBoard only), and what they show.
 PICTURES: dict[str, str] = {

@@ -19,7 +19,7 @@ from cfp.config import RunConfig, differences, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically
 from cfp.learner import Learner
-from dittogym.trajectories.storage import ZIP_ERRORS
+from dittogym.trajectories import ZIP_ERRORS
 
 VERSION = 3
 #: What torch raises for damaged files, besides ``pickle.UnpicklingError``.

@@ -53,7 +53,7 @@ class SACLearner(CFP, Learner):
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage before actor updates (a lean encoder learns earlier)."""
+        """Environment steps at the beginning of the stage before actor updates (the small encoder learns earlier)."""
         return max(self.hyperparameters.actor_start, self.hyperparameters.update_start)
 
     @classmethod

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from PIL import Image
 
-from dittogym.render.files import replacing
+from dittogym.files import replacing
 
 Frame = TypeVar("Frame")
 #: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from itertools import islice
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from dittogym.action import ActionIndexing, trained_indexing
-from dittogym.render.files import replacing
+from dittogym.action import ActionLayout, trained_layout
+from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import SHOWN, replay_page
@@ -24,10 +24,9 @@ from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
 Act: TypeAlias = Callable[[np.ndarray], Any]
-_OF_A_FILM = ("size", "rate", "speed", "zoom", "muscles")
 #: Options of :meth:`Recording.save` that have an effect, by suffix.
 OPTIONS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(UNITS, _OF_A_FILM),
+    **dict.fromkeys(UNITS, ("size", "rate", "speed", "zoom", "muscles")),
     ".png": ("size", "zoom", "muscles", "pictures"),
     ".html": ("speed",),
 }
@@ -145,7 +144,8 @@ class Recording:
             dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``.
         """
         shown: dict[str, Any] = {"size": size, "zoom": zoom, "muscles": muscles}
-        path = check_film(path, rate=rate, speed=speed, pictures=pictures, **shown)
+        path = check_path(path)
+        check_options(rate=rate, speed=speed, pictures=pictures, **shown)
         if path.suffix == ".html":
             with replacing(path) as aside:
                 aside.write_text(self.page(speed), encoding="utf-8")
@@ -185,13 +185,11 @@ class Recording:
         return f'<iframe srcdoc="{page}" width="600" height="800" style="border:0; max-width:100%"></iframe>'
 
 
-def check_film(path: str | os.PathLike[str], **options: Any) -> Path:
-    """Check the arguments of :meth:`Recording.save`, and return the path."""
-    path = Path(path)
-    if path.suffix not in OPTIONS:
+def check_path(path: str | os.PathLike[str]) -> Path:
+    """The path of a film, a filmstrip or a replay; a ``ValueError`` if it has another suffix."""
+    if Path(path).suffix not in OPTIONS:
         raise ValueError(f"path must end in one of {', '.join(OPTIONS)}, got {str(path)!r}")
-    check_options(**options)
-    return path
+    return Path(path)
 
 
 def check_options(
@@ -211,27 +209,26 @@ def check_options(
     checks.whole("pictures", pictures, 1)
 
 
-def check_film_options(path: Any, options: dict[str, Any]) -> None:
+def check_film(path: Any, options: Mapping[str, Any]) -> None:
     """Check the arguments of :meth:`Recording.save` for a single file, of which none may be without effect."""
-    known = (*_OF_A_FILM, "pictures")
-    if unknown := [name for name in options if name not in known]:
-        raise TypeError(f"film got an unexpected keyword argument {unknown[0]!r}; it takes {', '.join(known)}")
-    if path is not None:
-        suffix = check_film(path, **options).suffix
-        if suffix == ".mp4":
-            check_available()
-        if unused := [name for name in options if name not in OPTIONS[suffix]]:
-            allowed = ", ".join(OPTIONS[suffix])
-            raise ValueError(f"{unused[0]} must not be given with a path that ends in {suffix}, which takes {allowed}")
-    elif options:
-        raise TypeError(f"path must be given with {', '.join(options)}, got None")
+    check_options(**options)
+    if path is None:
+        if options:
+            raise TypeError(f"path must be given with {', '.join(options)}, got None")
+        return
+    suffix = check_path(path).suffix
+    if suffix == ".mp4":
+        check_available()
+    if unused := [name for name in options if name not in OPTIONS[suffix]]:
+        allowed = ", ".join(OPTIONS[suffix])
+        raise ValueError(f"{unused[0]} must not be given with a path that ends in {suffix}, which takes {allowed}")
 
 
 def film(
     env: Any, act: Act, path: Any, seed: Any, index: int = 0, *, max_steps: int | None = None, **options: Any
 ) -> Recording:
     """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
-    check_film_options(path, options)  # before the episode
+    check_film(path, options)  # before the episode
     recording = record(env, act, seed, index, max_steps)
     if path is not None:
         recording.save(path, **options)
@@ -301,7 +298,7 @@ def seed_noise(seed: int, step: int) -> None:
         torch.cuda.manual_seed_all(number)
 
 
-def as_function(policy: Any, layout: ActionIndexing) -> Act:
+def as_function(policy: Any, layout: ActionLayout) -> Act:
     """A policy as a function of observations.
 
     Args:
@@ -314,7 +311,7 @@ def as_function(policy: Any, layout: ActionIndexing) -> Act:
         TypeError: It is neither.
         ValueError: It was trained with another ``action_layout``.
     """
-    if (trained := trained_indexing(policy)) not in (None, layout):
+    if (trained := trained_layout(policy)) not in (None, layout):
         raise ValueError(f"policy must be one for action_layout {layout!r} of the environment, got one for {trained!r}")
     if not hasattr(policy, "predict"):
         if not callable(policy):

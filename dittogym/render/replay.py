@@ -16,6 +16,8 @@ import numpy as np
 from dittogym.render.scene import VIEW_WIDTH, Scene, Shot
 
 PLAYER = Path(__file__).parent / "replay.html"
+#: Draws a scene in a browser; :mod:`cfp.play` serves the same file.
+SCENE = Path(__file__).parent / "scene.js"
 #: Quantities of particles that a replay holds; it computes speeds itself.
 SHOWN = ("muscle", "deformation")
 #: At most so many moments and particles are kept, evenly spread.
@@ -43,7 +45,8 @@ def replay_page(
     header, data = encode(scene, shots)
     header |= {"rewards": [round(reward, 4) for reward in rewards], "success": success, "speed": speed}
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    page = PLAYER.read_text(encoding="utf-8").replace("%TITLE%", escape(scene.task)).replace("%HEADER%", text)
+    page = PLAYER.read_text(encoding="utf-8").replace("%SCENE%", SCENE.read_text(encoding="utf-8"))
+    page = page.replace("%TITLE%", escape(scene.task)).replace("%HEADER%", text)
     return page.replace("%DATA%", base64.b64encode(data).decode())
 
 

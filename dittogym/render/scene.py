@@ -1,33 +1,67 @@
-"""The arrays from which pictures, films and replays are drawn."""
+"""What is drawn of a simulation: the static scene, the particles of a moment, and the colours of their quantities."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
-from dittogym.geometry import Box
-from dittogym.model import EnvState, Model
-from dittogym.observation.image import SIZE
-from dittogym.render.colours import (
-    GROUND_BODY,
-    OBJECT,
-    ROBOT,
-    SCALES,
-    Colour,
-    muscle_activity,
-    shear_strain,
-    speed,
-)
+from dittogym.action import place
+from dittogym.core import EnvState, Model
+from dittogym.geometry import NODES, Box, centre_in_window
+from dittogym.observation import SIZE
 from dittogym.spec import TaskSpec
-from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
 
+#: Red, green and blue, 0 to 255.
+Colour: TypeAlias = tuple[int, int, int]
+
+ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
+EXPAND, RELAX, CONTRACT = (52, 92, 200), (190, 190, 190), (206, 60, 52)
+
+
+class ColourScale(NamedTuple):
+    """Colours of a quantity.
+
+    Attributes:
+        label: What it is, with its unit.
+        low: Value of the first colour.
+        high: Value of the last one; larger values have the same colour.
+        stops: RGB colours at equal distances from ``low`` to ``high``, between which colours are interpolated.
+        robot_only: Whether other bodies do not have it; they have colours of their own.
+    """
+
+    label: str
+    low: float
+    high: float
+    stops: tuple[Colour, ...]
+    robot_only: bool = False
+
+    def codes(self, values: np.ndarray) -> np.ndarray:
+        """Values (N,) as uint8, from 0 for ``low`` to 254 for ``high``; the middle where they are NaN."""
+        at = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
+        return np.where(np.isnan(at), 127.0, 254.0 * at).round().astype(np.uint8)
+
+    def palette(self) -> np.ndarray:
+        """The colour of each code, (255, 3) uint8."""
+        at, stops = np.linspace(0.0, 1.0, len(self.stops)), np.array(self.stops, np.float64)
+        mixed = [np.interp(np.linspace(0.0, 1.0, 255), at, column) for column in stops.T]
+        return np.stack(mixed, axis=1).round().astype(np.uint8)
+
+
+SCALES = {
+    "muscle": ColourScale("expansion to contraction", -1.0, 1.0, (EXPAND, RELAX, CONTRACT), True),
+    "deformation": ColourScale(
+        "shear strain", 0.0, 0.1, ((38, 70, 83), (42, 157, 143), (233, 196, 106), (231, 111, 81))
+    ),
+    "speed": ColourScale("speed, m/s", 0.0, 1.5, ((49, 54, 110), (78, 121, 190), (120, 200, 190), (253, 231, 130))),
+}
 #: Names of all quantities of particles.
 QUANTITIES = tuple(SCALES)
 #: Radius of a particle by the distance between particles, which closes even a body of random positions; of a grain.
@@ -97,8 +131,8 @@ class Shot(NamedTuple):
 
     Attributes:
         x: (N, 2) float32 positions in the world, m.
-        values: Quantities of :data:`dittogym.render.colours.SCALES` by name, uint8 over the range of their scale: (N,),
-            of the muscles (n,) for the robot's particles; these are missing where nothing has acted yet.
+        values: Quantities of :data:`SCALES` by name, uint8 over the range of their scale: (N,), of the muscles (n,) for
+            the robot's particles; these are missing where nothing has acted yet.
         origin: (2,) lower left corner of the simulated window in the world, m.
         view: (2,) centre of the observed region in the window, m.
         centre: (2,) the robot's centre in the world, m.
@@ -157,9 +191,8 @@ def take(
     index = int(index)
     one = slice(index, index + 1)
     view = centre_in_window(model.spec.view, state.centre[one], state.origin[one])
-    origin, view, centre = (
-        place.detach().cpu().double().numpy()[0] for place in (state.origin[one], view, state.centre[one])
-    )
+    points = (state.origin[one], view, state.centre[one])
+    origin, view, centre = (point.detach().cpu().double().numpy()[0] for point in points)
     values = {}
     for by in quantities:
         if by != "muscle":
@@ -181,3 +214,40 @@ def check_view(size: int, zoom: float | None) -> float:
     if zoom is not None:
         checks.number("zoom", zoom, least=0.05)  # lines and numbers are drawn for every 0.1 m
     return VIEW_WIDTH if zoom is None else 1.0 / zoom
+
+
+def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
+    """Mean actuation of the muscles at each particle of the robot, as a fraction of their limit, (n,) in [-1, 1].
+
+    Args:
+        model: The task.
+        state: Its present state.
+        index: Which element of the batch.
+        actuation: (B, 2, P, P) on the patch, Pa.
+    """
+    spec, one = model.spec, slice(index, index + 1)
+    centre = centre_in_window(spec.patch_centre, state.centre[one], state.origin[one])
+    nodes = place(actuation[one], centre, NODES)[0].cpu().numpy().sum(0, dtype=np.float64)
+    robot_x, origin = state.particles.x[index, : model.num_robot_particles], state.origin[index]
+    relative = robot_x.detach().cpu().numpy().astype(np.float64) - origin.detach().cpu().numpy()
+    finite = np.isfinite(relative).all(1, keepdims=True)
+    at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
+    strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation
+    # Without muscles there is nothing to pull.
+    return np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1) if strength else np.zeros(len(at))
+
+
+def shear_strain(state: EnvState, index: int) -> np.ndarray:
+    """Norm of the deviator of the logarithmic elastic strain of each particle, (N,).
+
+    Where it would exceed ``yield_stress / (2 mu)``, a robot flows.
+    """
+    a, b, c, d = state.particles.F[index].detach().flatten(1).double().cpu().unbind(1)
+    total, difference = torch.hypot(a + d, b - c), torch.hypot(a - d, b + c)  # of the principal stretches
+    return (math.sqrt(2.0) * torch.atanh((difference / total).clamp_max(1.0 - 1e-9))).numpy()
+
+
+def speed(state: EnvState, index: int) -> np.ndarray:
+    """Speed of each particle (N,), m/s."""
+    x, y = state.particles.v[index].detach().unbind(-1)
+    return torch.hypot(x, y).cpu().numpy()  # many times faster than Tensor.norm

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
 from dittogym.bodies.json_values import from_values
-from dittogym.bodies.place import check_place
+from dittogym.bodies.positions import check_place
 from dittogym.geometry import Obstacle
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
@@ -63,35 +62,23 @@ def check_task(task: object) -> None:
     Raises:
         ValueError: There is no such task.
     """
-    if isinstance(task, TaskSpec):
-        needs = "must be the name under which dittogym.register knows the function that makes it"
-        raise ValueError(f"task {needs}, got the TaskSpec {task.name!r} itself")
-    if (allowed := _allowed_instead(task)) is not None:
-        raise ValueError(f"task must be one of {allowed}, got {task!r}")
-
-
-def _allowed_instead(task: object) -> str | None:
-    """What is allowed in place of something that is not a task; ``None`` where it is one."""
-    allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
-    if not isinstance(task, str):
-        return f"{allowed}; dittogym.register gives a function a name" if callable(task) else allowed
-    module, colon, name = task.rpartition(":")
-    if colon:
-        if not module.isidentifier():  # options from elsewhere must not reach files below the current folder
-            return f"{allowed} (the name of a module must be a word, without dots)"
-        try:
-            imported = importlib.import_module(module)
-        except Exception as error:  # whatever the module does
-            if isinstance(error, ModuleNotFoundError) and error.name == module:
-                return f"{allowed} (there is no module {module!r} in the working directory or on the Python path)"
-            last = traceback.extract_tb(error.__traceback__)[-1]  # of a SyntaxError, the message names the line
-            place = "" if isinstance(error, SyntaxError) else f"{Path(last.filename).name}, line {last.lineno}, "
-            return f"{allowed} (module {module!r}: {place}{type(error).__name__}: {error})"
-        if getattr(imported, "__file__", None) is None:
-            return f"{allowed} (module {module!r} is a folder, not a file)"
-    if name in TASKS:
-        return None
-    return f"{allowed} (module {module!r} does not register {name!r})" if colon else allowed
+    reason = ""
+    if isinstance(task, TaskSpec) or callable(task):
+        reason = "; dittogym.register gives the function that makes a TaskSpec a name"
+    elif isinstance(task, str):
+        module, colon, name = task.rpartition(":")
+        if colon and not module.isidentifier():  # options from elsewhere must not reach files below the current folder
+            reason = " (the name of a module must be a word, without dots)"
+        elif colon:
+            try:
+                importlib.import_module(module)
+            except Exception as error:  # whatever the module does
+                reason = f" (module {module!r}: {type(error).__name__}: {error})"
+            else:
+                reason = "" if name in TASKS else f" (module {module!r} does not register {name!r})"
+        if not reason and name in TASKS:
+            return
+    raise ValueError(f"task must be one of {', '.join(sorted(TASKS))} or MODULE:NAME{reason}, got {task!r}")
 
 
 def make_spec(

@@ -3,10 +3,9 @@
 import math
 
 from dittogym.bodies.shapes import Disc, Rectangle
-from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
+from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes, side_walls
+from dittogym.rewards import Reward, TaskState, Transition
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 from torchmpm import VelocityRule
 
 GOAL = (0.15, 0.25)
@@ -46,24 +45,24 @@ LEFT_BLOCK = Obstacle(
 )
 
 
-def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
+def initial_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
     """The cube's centre: the hand is chosen by where the cube was a step ago."""
-    return {"object_com": moment.object_com}
+    return {"object_com": transition.object_com}
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Distances of the cube from the goal, and of the hand from the cube."""
-    x, cube = moment.robot_x, moment.object_com
-    hand = moment.ops.mean_over_nearest(x, x, moment.memory["object_com"], HAND)
+    x, cube = transition.robot_x, transition.object_com
+    hand = transition.ops.mean_over_nearest(x, x, transition.task_state["object_com"], HAND)
     to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - cube.new_tensor(spec.goal), hand - cube))
-    return Outcome(
+    return Reward(
         terms={
-            "object_distance": -moment.ops.clamp(to_goal, high=CAP),
-            "hand_distance": -moment.ops.clamp(to_cube, high=CAP),
+            "object_distance": -transition.ops.clamp(to_goal, high=CAP),
+            "hand_distance": -transition.ops.clamp(to_cube, high=CAP),
         },
         success=to_goal < CAUGHT,
         info={"object_distance": to_goal, "hand_distance": to_cube},
-        memory={"object_com": cube},
+        task_state={"object_com": cube},
     )
 
 
@@ -81,12 +80,11 @@ def catch() -> TaskSpec:
         damping=0.999,
         window=Window(left=-0.5),
         view=(0.5, 0.4),
-        reach=(0.5, 0.4),
+        patch_centre=(0.5, 0.4),
         obstacles=(side_walls(79), RIGHT_BLOCK, LEFT_BLOCK, floor(), ceiling(126)),
         goal=GOAL,
         split_limit=0.13,
-        initial_memory=initial_memory,
-        stale_memory=("object_com",),
+        initial_task_state=initial_task_state,
         reward_fn=reward_fn,
         weights={"object_distance": 50.0, "hand_distance": 30.0, "split": 1.0, "action": 2e-4, "alive": 21.0},
     )

@@ -1,11 +1,9 @@
 """DIG: get through loose soil to a point in it."""
 
 from dittogym.bodies.shapes import Disc, Rectangle
-from dittogym.contract import Moment, Outcome
-from dittogym.geometry import ceiling, floor, side_walls
-from dittogym.reward_ops import signed_quadratic
+from dittogym.geometry import Window, ceiling, floor, side_walls
+from dittogym.rewards import Reward, Transition, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 from torchmpm import Snow, lame
 
 GOAL = (0.2, 0.17)
@@ -18,13 +16,13 @@ SOIL_PLACE = Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2)
 SOIL = BodySpec(SOIL_PLACE, count=8000, lite=3400, material=SNOW, hidden_velocity=True)
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Mean distance of all particles from the goal, under a square root; speed to the right and downwards."""
-    x = moment.robot_x
+    x = transition.robot_x
     distance = (x - x.new_tensor(spec.goal)).abs().sum(-1).mean(1)
-    right, up = moment.now.velocity.unbind(1)
-    rightwards, downwards = (moment.ops.clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in (right, -up))
-    return Outcome(
+    right, up = transition.now.velocity.unbind(1)
+    rightwards, downwards = (transition.ops.clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in (right, -up))
+    return Reward(
         terms={"distance": -distance.sqrt(), "velocity": rightwards + downwards},
         success=distance < REACHED,
         info={"distance": distance},

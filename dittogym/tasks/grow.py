@@ -1,11 +1,9 @@
 """GROW: reach a point above, past two beams."""
 
 from dittogym.bodies.shapes import Lattice
-from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward_ops import count_of, distance, drop_widest, pick
+from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes, side_walls
+from dittogym.rewards import Reward, TaskState, Transition, count_of, distance, drop_widest, pick
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 from torchmpm import VelocityRule
 
 GOAL = (0.0, 0.5)
@@ -41,20 +39,20 @@ LEFT_BEAM = Obstacle(
 )
 
 
-def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
+def initial_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
     """The tip: the highest particles at the start; of equally high ones the first (undefined in the reference)."""
-    x = moment.robot_x.detach()
+    x = transition.robot_x.detach()
     highest = x[..., 1].argsort(dim=1, descending=True, stable=True)[:, : count_of(TIP, x)]
     return {"tip": drop_widest(highest, x)}
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Mean distance of the tip from the goal, under a square root."""
-    tip = pick(moment.particles.x, moment.memory["tip"])
+    tip = pick(transition.particles.x, transition.task_state["tip"])
     gap = distance(tip, tip.new_tensor([spec.goal])).mean(1)
     reached = gap < REACHED
-    return Outcome(
-        terms={"distance": -gap.sqrt(), "success": moment.ops.heaviside(REACHED - gap, BONUS_WIDTH)},
+    return Reward(
+        terms={"distance": -gap.sqrt(), "success": transition.ops.heaviside(REACHED - gap, BONUS_WIDTH)},
         terminated=reached | (gap > LOST),
         success=reached,
         info={"distance": gap},
@@ -74,11 +72,11 @@ def grow() -> TaskSpec:
         damping=0.999,
         window=Window(left=-0.5),
         view=(0.5, 0.4),
-        reach=(0.5, 0.4),
+        patch_centre=(0.5, 0.4),
         obstacles=(side_walls(39), floor(), ceiling(126), RIGHT_BEAM, LEFT_BEAM),
         goal=GOAL,
         split_limit=0.16,
-        initial_memory=initial_memory,
+        initial_task_state=initial_task_state,
         reward_fn=reward_fn,
         weights={"distance": 40.0, "success": 200.0, "split": 1.0, "action": 2e-4, "alive": 23.0},
     )

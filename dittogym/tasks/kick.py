@@ -1,11 +1,9 @@
 """KICK: drive a cube to the right and stay behind it."""
 
 from dittogym.bodies.shapes import Disc, Rectangle
-from dittogym.contract import Moment, Outcome
-from dittogym.geometry import ceiling, floor
-from dittogym.reward_ops import signed_quadratic
+from dittogym.geometry import Window, ceiling, floor
+from dittogym.rewards import Reward, Transition, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 
 #: Displacement of the cube that counts as success (our definition), m.
 GOAL = 1.0
@@ -15,18 +13,18 @@ REAR_LIMIT = -0.2
 GAP_CAP = 0.3
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Displacement and speed of cube and robot, and the distance between them."""
-    now, start = moment.now, moment.start
+    now, start = transition.now, transition.start
     assert now.object_velocity is not None and start.object_com is not None
-    kicked = moment.object_com[:, 0] - start.object_com[:, 0]
+    kicked = transition.object_com[:, 0] - start.object_com[:, 0]
     travelled = now.com[:, 0] - start.com[:, 0]
-    clamp = moment.ops.clamp
+    clamp = transition.ops.clamp
     object_location, location = (clamp(signed_quadratic(z, 4.0), -20.0, 30.0) for z in (kicked, travelled))
     speeds = (now.velocity[:, 0], now.object_velocity[:, 0])
     velocity, object_velocity = (clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in speeds)
-    gap = (now.com[:, 0] - moment.object_com[:, 0]).abs()
-    return Outcome(
+    gap = (now.com[:, 0] - transition.object_com[:, 0]).abs()
+    return Reward(
         terms={
             "object_location": object_location,
             "location": location,
@@ -54,7 +52,7 @@ def kick() -> TaskSpec:
         damping=0.999,
         window=Window(follow=0.3),
         view=(None, 0.28),
-        reach=(None, 0.28),
+        patch_centre=(None, 0.28),
         obstacles=(floor(), ceiling(126)),
         split_limit=0.11,
         reward_fn=reward_fn,

@@ -1,10 +1,9 @@
 """OBSTACLE: run to the right, over a staircase."""
 
 from dittogym.bodies.shapes import Lattice
-from dittogym.geometry import Obstacle, ceiling, floor, nodes
+from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks.run import Forward
-from dittogym.window import Window
 from torchmpm import VelocityRule
 
 #: Displacement that brings the robot past the stairs and counts as success (our definition), m.
@@ -35,7 +34,7 @@ def obstacle() -> TaskSpec:
         gravity=(0.0, -5.0),
         window=Window(follow=0.4),
         view=(None, 0.28),
-        reach=(None, 0.28),
+        patch_centre=(None, 0.28),
         obstacles=(*map(stair, range(6)), floor(), ceiling(119)),
         split_limit=0.10,
         reward_fn=Forward(GOAL),

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 from dittogym.bodies.shapes import Disc
-from dittogym.contract import Moment, Outcome
-from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.reward_ops import signed_quadratic
+from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes
+from dittogym.rewards import Reward, Transition, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 from torchmpm import VelocityRule
 
 #: Displacement from which the location term no longer grows, m; reaching it counts as success (our definition).
@@ -34,14 +32,14 @@ class Forward:
 
     goal: float  # Displacement that counts as success, m
 
-    def __call__(self, moment: Moment, spec: TaskSpec) -> Outcome:
+    def __call__(self, transition: Transition, spec: TaskSpec) -> Reward:
         """Displacement, speed and end of the episode."""
-        travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
-        values = (travelled, moment.now.velocity[:, 0])
-        location, velocity = (moment.ops.clamp(signed_quadratic(z, 5.0), -20.0, 20.0) for z in values)
-        return Outcome(
+        travelled = transition.now.com[:, 0] - transition.start.com[:, 0]
+        values = (travelled, transition.now.velocity[:, 0])
+        location, velocity = (transition.ops.clamp(signed_quadratic(z, 5.0), -20.0, 20.0) for z in values)
+        return Reward(
             terms={"location": location, "velocity": velocity},
-            terminated=moment.now.com[:, 0] < REAR_LIMIT,
+            terminated=transition.now.com[:, 0] < REAR_LIMIT,
             success=travelled >= self.goal,
             info={"displacement": travelled},
         )
@@ -60,7 +58,7 @@ def run() -> TaskSpec:
         damping=0.999,
         window=Window(follow=0.4),
         view=(None, 0.28),
-        reach=(None, 0.28),
+        patch_centre=(None, 0.28),
         obstacles=(HANGING_BLOCK, floor(), ceiling(119)),
         split_limit=0.10,
         reward_fn=Forward(GOAL),

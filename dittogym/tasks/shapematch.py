@@ -4,8 +4,8 @@ import torch
 
 from dittogym.bodies.images import PictureLike
 from dittogym.bodies.shapes import Disc
-from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor
+from dittogym.rewards import Reward, Transition
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks.targets import load_target
 
@@ -13,14 +13,14 @@ from dittogym.tasks.targets import load_target
 MATCH = 0.8
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Number of pixels in which silhouette and target differ; in the smooth form the number to expect."""
-    target = torch.as_tensor(spec.target, device=moment.observation.device)
-    silhouette = moment.ops.silhouette(moment.observation)
-    differing = (silhouette.to(moment.now.com) - target.to(moment.now.com)).abs().sum((1, 2))
+    target = torch.as_tensor(spec.target, device=transition.observation.device)
+    silhouette = transition.ops.silhouette(transition.observation)
+    differing = (silhouette.to(transition.now.com) - target.to(transition.now.com)).abs().sum((1, 2))
     occupied = silhouette >= 0.5
     iou = (occupied & target).sum((1, 2)) / (occupied | target).sum((1, 2))
-    return Outcome(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
+    return Reward(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 
 
 def shapematch(target: PictureLike = "star", fit: bool = True) -> TaskSpec:

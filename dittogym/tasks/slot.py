@@ -5,13 +5,10 @@ from typing import Literal
 
 from torch import Tensor
 
-from dittogym.arguments import choice
 from dittogym.bodies.shapes import Disc, Rectangle
-from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.reward_ops import distance, signed_quadratic
+from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes
+from dittogym.rewards import Reward, TaskState, Transition, distance, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import Window
 from torchmpm import VelocityRule, fixed
 
 #: Below this height the cap has fallen, and the episode ends, m.
@@ -66,31 +63,31 @@ FRAME = Obstacle(
 )
 
 
-def front_distance(moment: Moment) -> Tensor:
+def front_distance(transition: Transition) -> Tensor:
     """Mean distance of the robot's front from the cap's centre, (B,), m."""
-    x, cap = moment.robot_x, moment.object_com
-    return moment.ops.mean_over_nearest(distance(x, cap)[..., None], x, cap, FRONT)[:, 0]
+    x, cap = transition.robot_x, transition.object_com
+    return transition.ops.mean_over_nearest(distance(x, cap)[..., None], x, cap, FRONT)[:, 0]
 
 
-def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
+def initial_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
     """The distance at the start, against which progress is measured."""
-    return {"front_distance": front_distance(moment)}
+    return {"front_distance": front_distance(transition)}
 
 
-def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Approach to the cap, displacement of the cap, where it falls, and speed in both directions."""
-    cap, front, ops = moment.object_com, front_distance(moment), moment.ops
-    z = 2.0 * (moment.memory["front_distance"] - front)
+    cap, front, ops = transition.object_com, front_distance(transition), transition.ops
+    z = 2.0 * (transition.task_state["front_distance"] - front)
     fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
     side = 2.0 * ops.heaviside(cap[:, 0] - FAR_SIDE, FALL_WIDTH) - 1.0
-    return Outcome(
+    return Reward(
         terms={
             "approach": ops.clamp(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0),
             "object_location": 200.0 * (cap[:, 0] - CAP_START),
             "fall": 100.0 * side * ops.heaviside(FALLEN - cap[:, 1], FALL_WIDTH),
-            "velocity": ops.clamp(signed_quadratic(moment.now.velocity, 10.0), -20.0, 20.0).sum(1),
+            "velocity": ops.clamp(signed_quadratic(transition.now.velocity, 10.0), -20.0, 20.0).sum(1),
         },
-        terminated=fallen | (moment.now.com[:, 0] < REAR_LIMIT),
+        terminated=fallen | (transition.now.com[:, 0] < REAR_LIMIT),
         success=fallen & far,
         info={"distance": front},
     )
@@ -102,7 +99,9 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
     Args:
         variant: ``"registered"``, or ``"published"`` for the material of the published training run.
     """
-    mu, yield_stress, max_actuation = choice("variant", variant, VARIANTS)
+    if variant not in tuple(VARIANTS):
+        raise ValueError(f"variant must be one of {tuple(VARIANTS)}, got {variant!r}")
+    mu, yield_stress, max_actuation = VARIANTS[variant]
     return TaskSpec(
         name="slot",
         horizon=1500,
@@ -114,10 +113,10 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
         gravity=(0.0, -20.0),
         window=Window(follow=0.25),
         view=(None, 0.28),
-        reach=(None, 0.28),
+        patch_centre=(None, 0.28),
         obstacles=(BLOCK, SHELF, POST, floor(), ceiling(119), FRAME),
         split_limit=0.12,
-        initial_memory=initial_memory,
+        initial_task_state=initial_task_state,
         reward_fn=reward_fn,
         weights={
             "approach": 2.0,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from dittogym.bodies.images import PictureLike, read_mask
-from dittogym.observation.image import SIZE
+from dittogym.observation import SIZE
 from torchmpm import checks
 
 #: Pixels that the robot of SHAPE MATCH covers at the start.

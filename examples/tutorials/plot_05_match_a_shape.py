@@ -16,7 +16,7 @@ import torch
 from torch.nn.functional import conv2d
 
 import dittogym
-from dittogym.observation.image import soft_silhouette
+from dittogym.observation import soft_silhouette
 
 # segment=None: no checkpoints, so the gradient is faster and needs more memory
 env = dittogym.TorchEnv("shapematch", resolution=16, particles="lite", target="star", segment=None)

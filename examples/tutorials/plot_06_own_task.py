@@ -8,7 +8,7 @@ gradients, and with every algorithm.
 """
 
 # %%
-# The function gets a :class:`dittogym.contract.Moment` and returns named terms, one number for each simulation of the
+# The function gets a :class:`dittogym.Transition` and returns named terms, one number for each simulation of the
 # batch. Each term is multiplied by its weight. The environment adds the terms that all tasks share, each with its
 # weight or else 0: the action cost ``action``, the penalty ``split`` for a torn robot, and ``alive``, a constant for
 # every step, which HOP leaves out.
@@ -23,10 +23,10 @@ import dittogym
 from dittogym.geometry import ceiling, floor, solid
 
 
-def reward_fn(moment: dittogym.contract.Moment, spec: dittogym.TaskSpec) -> dittogym.Outcome:
+def reward_fn(transition: dittogym.Transition, spec: dittogym.TaskSpec) -> dittogym.Reward:
     """Reward height above the start; it is a success to end 3 cm higher."""
-    height = moment.now.com[:, 1] - moment.start.com[:, 1]
-    return dittogym.Outcome({"height": height}, success=height > 0.03)
+    height = transition.now.com[:, 1] - transition.start.com[:, 1]
+    return dittogym.Reward({"height": height}, success=height > 0.03)
 
 
 def hop(wall: int = 60, effort: float = 2e-4) -> dittogym.TaskSpec:
@@ -66,13 +66,13 @@ for name, value in sums.items():
 #   the best policy does not move at all.
 # - **Reward progress, not only the goal.** A term that is the same for all reachable states gives no gradient. Height
 #   pays as soon as the robot rises a little; a bonus for 3 cm alone would not.
-# - **Measure from the start** (``moment.start``), so that the return does not depend on where a robot was placed.
+# - **Measure from the start** (``transition.start``), so that the return does not depend on where a robot was placed.
 # - **Bound what can be exploited**: a robot can throw single particles away, so use means over the robot, clip speeds,
 #   and keep the penalty ``split`` for a torn robot.
 # - **Keep success separate from the reward.** Success says what you want; the reward is what the policy is trained on.
 #   An episode that ends with success earns nothing afterwards, so the bonus must exceed what staying would earn.
-# - **Prefer smooth functions of the particles.** Then gradients exist; for counts and thresholds, ``moment.ops`` has
-#   operations with smooth versions.
+# - **Prefer smooth functions of the particles.** Then gradients exist; for counts and thresholds, ``transition.ops``
+#   has operations with smooth versions.
 #
 # Because ``reward_fn`` is made of torch operations, the return can be maximised by gradient ascent, a quick test of
 # whether a reward leads anywhere. Here it is with two weights of the action cost:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import dittogym
-from dittogym.observation.image import soft_silhouette
+from dittogym.observation import soft_silhouette
 
 STEPS, RESOLUTION, ITERATIONS = 10, 4, 40
 TRUTH = {"mu": 700.0, "yield_stress": 45.0}

@@ -63,14 +63,9 @@ def test_help_shows_basic_options_first(words, basic, capsys):
 
 
 def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys):
-    assert output_of(capsys, "train", "--task", "run", "--steps", "0") == (
-        2,
-        "",
-        "error: steps must be at least 1, got 0\n",
-    )
-    code, text, _ = output_of(
-        capsys, "train", "--algo=cem", "--task", "run", "--dry-run", "--out", str(tmp_path / "run")
-    )
+    code, text, error = output_of(capsys, "train", "--task", "run", "--steps", "0")
+    assert (code, text) == (2, "") and error.startswith("error: steps must")
+    code, text, _ = output_of(capsys, "train", "--algo=cem", "--task", "run", "--dry-run", "--out", str(tmp_path / "r"))
     assert code == 0 and '"algo": "cem"' in text
 
 
@@ -88,10 +83,7 @@ def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):
     assert output_of(capsys) == output_of(capsys, "-h") and console.main([]) == 0
     capsys.readouterr()
     code, text, error = output_of(capsys, "tarin")
-    assert (code, text) == (
-        2,
-        "",
-    ) and error == f"error: PROGRAM must be one of {', '.join(console.PROGRAMS)}, got 'tarin'\n"
+    assert (code, text) == (2, "") and error.startswith("error: PROGRAM must be one of train, ")
 
 
 def test_tasks_of_the_working_directory_are_found(tmp_path):
@@ -106,10 +98,11 @@ def test_tasks_of_the_working_directory_are_found(tmp_path):
 
 
 MODULES = (
-    *(f"cfp.{name}" for name in ("train", "evaluate", "robustness")),
-    *(f"baselines.{name}" for name in ("train", "evaluate", "replay", "robustness")),
-    *(f"baselines.{name}" for name in ("distill", "compare", "leaderboard")),
-    *("baselines.gradlab", "dittogym.play"),
+    *(f"cfp.{name}" for name in ("train", "evaluate", "robustness", "play")),
+    *(
+        f"baselines.{name}"
+        for name in ("train", "evaluate", "replay", "robustness", "distill", "compare", "leaderboard")
+    ),
 )
 
 

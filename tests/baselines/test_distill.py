@@ -29,7 +29,7 @@ from cfp.policy import describe_run, read_policy, write_policy
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
 from dittogym import TorchEnv
-from dittogym.action import patch_field, to_grid_indexing
+from dittogym.action import patch_field, to_grid_layout
 
 
 def make(**changes):
@@ -260,10 +260,10 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
     action = PolicyTeacher(record, "image").act(env, seen)
     as_grid = PolicyTeacher(record, "grid").act(env, seen)
-    assert torch.equal(as_grid, to_grid_indexing(action, "image"))
+    assert torch.equal(as_grid, to_grid_layout(action, "image"))
     record.description["environment"] = {"action_layout": "grid"}
     back = PolicyTeacher(record, "image").act(env, seen)
-    assert torch.equal(to_grid_indexing(back, "image"), action)
+    assert torch.equal(to_grid_layout(back, "image"), action)
 
 
 def test_sequence_teaches_by_the_step_of_the_episode():

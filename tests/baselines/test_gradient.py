@@ -11,7 +11,7 @@ from baselines import Gradient, OpenLoop
 from baselines.trajectory.optimise import Episode
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-from dittogym.contract import Outcome
+from dittogym.rewards import Reward
 
 
 def make(task="shapematch", **changes):
@@ -59,9 +59,9 @@ def test_descent_improves_the_true_return():
 
 
 def test_rewards_with_steps_are_replaced_by_smooth_ones(request):
-    def ahead(moment, spec):
-        x = moment.robot_x[..., 0].mean(1)
-        return Outcome(terms={"ahead": moment.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
+    def ahead(transition, spec):
+        x = transition.robot_x[..., 0].mean(1)
+        return Reward(terms={"ahead": transition.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
 
     def stepping():
         return replace(dittogym.make_spec("run"), name="stepping", reward_fn=ahead, weights={"ahead": 1.0})
@@ -102,8 +102,8 @@ def test_windows_cut_the_gradient_but_not_the_loss():
     assert not torch.allclose(halves.gradient[:3], whole.gradient[:3], rtol=0.1, atol=1e-9)
 
 
-def test_iterations_do_not_depend_on_those_before_even_with_reference_parity():
-    environment = EnvironmentConfig(1, 300, 100, parity="reference")
+def test_iterations_do_not_depend_on_those_before():
+    environment = EnvironmentConfig(1, 300, 100)
     algorithm = shorten(Gradient(make("run", environment=environment, polish=1, polish_grid=4), 1), 4)
     with torch.no_grad():
         algorithm.theta += torch.linspace(0.0, 1.0, 4)
@@ -212,13 +212,11 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
 
 
 def test_only_polish_takes_place_where_the_result_is_evaluated():
-    environment = EnvironmentConfig(1, 300, 4, parity="reference")
+    environment = EnvironmentConfig(1, 300, 4, action_layout="grid")
     first, polish = (
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
-    for env, count, scaled in ((first.env, 200, True), (polish.env, 300, False)):
-        assert env.num_particles == count and (max(env.model.camera.particle_weight) > 1) is scaled
-        assert env.model.camera.pixels is not scaled
+    assert (first.env.num_particles, polish.env.num_particles) == (200, 300)
     assert first.env.action_layout == polish.env.action_layout == "grid"
 
 

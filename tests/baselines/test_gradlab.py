@@ -143,7 +143,7 @@ def test_folder_is_made_before_the_measurement(tmp_path, capsys, monkeypatch) ->
 
 
 def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None:
-    outcome = lambda moment, _: dittogym.Outcome({"n": moment.now.split.detach()})  # noqa: E731
+    outcome = lambda transition, _: dittogym.Reward({"n": transition.now.radius_of_gyration.detach()})  # noqa: E731
     weights = {"n": 1.0, "action": 2e-4, "split": 1.0}  # whose costs have a gradient
     counts = replace(dittogym.make_spec("run"), name="count", reward_fn=outcome, weights=weights)
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)

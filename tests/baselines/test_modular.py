@@ -22,7 +22,7 @@ from cfp.policy import describe_run
 from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
 from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing, to_grid_indexing
+from dittogym.action import from_grid_layout, to_grid_layout
 
 KINDS = ("gnn", "transformer")
 FEATURES = 10
@@ -168,7 +168,7 @@ def test_policy_answers_in_the_orientation_that_it_was_trained_in(trained):
         segments.step(values)
         moved = env.state.x
         env.reset(seed=0)
-        env.step(from_grid_indexing(to_grid_indexing(torch.from_numpy(actions[layout]), trained), layout))
+        env.step(from_grid_layout(to_grid_layout(torch.from_numpy(actions[layout]), trained), layout))
         assert torch.equal(env.state.x, moved)
     assert np.array_equal(*actions.values())
 

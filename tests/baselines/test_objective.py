@@ -7,7 +7,7 @@ import torch
 
 from baselines.trajectory.objective import Objective, gaussian_matrix
 from dittogym import TorchEnv, make_spec
-from dittogym.contract import Outcome
+from dittogym.rewards import Reward
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 3.5])
@@ -45,8 +45,8 @@ def test_tasks_without_a_picture_minimise_the_negative_reward():
 
 
 def test_the_reward_of_a_task_derived_from_shape_match_counts():
-    def drift(moment, spec):
-        return Outcome({"drift": moment.now.com[:, 0]})
+    def drift(transition, spec):
+        return Reward({"drift": transition.now.com[:, 0]})
 
     spec = dataclasses.replace(make_spec("shapematch"), name="drift", reward_fn=drift, weights={"drift": 1.0})
     env = TorchEnv(spec, resolution=8, particles=100, substeps=1)

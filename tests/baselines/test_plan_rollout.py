@@ -27,8 +27,8 @@ def test_rewards_are_those_of_the_environment(task: str) -> None:
     assert torch.equal(result.rewards, torch.stack([step[1] for step in steps]))
     assert torch.equal(result.true_rewards, torch.stack([step[-1]["true_reward"] for step in steps]))
     assert not result.ended.any() and torch.equal(result.state.particles.x, env.state.x)
-    for name, value in env.env_state.memory.items():
-        assert torch.equal(result.state.memory[name], value)
+    for name, value in env.env_state.task_state.items():
+        assert torch.equal(result.state.task_state[name], value)
 
 
 def test_checkpoints_do_not_change_the_gradient() -> None:

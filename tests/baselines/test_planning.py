@@ -182,7 +182,7 @@ def test_a_search_without_any_finite_gradient_warns(monkeypatch) -> None:
 def test_spread_near_the_limit_costs() -> None:
     env = small("run")
     plan = torch.zeros(1, 1, *env.action_shape)
-    spread = float(env.env_state.start.split)
+    spread = float(env.env_state.start.radius_of_gyration)
     for stretch in (1.0, 0.094 / spread):
         env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
         values = []

@@ -15,8 +15,8 @@ from cfp.errors import ConfigError
 from cfp.experiment.training import parse
 from cfp.files import write_json
 from cfp.tables import read_table
-from dittogym.action import patch_field, to_grid_indexing
-from dittogym.reward_ops import action_cost
+from dittogym.action import patch_field, to_grid_layout
+from dittogym.rewards import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
 IMAGES = np.zeros((2, 3, 64, 64), np.uint8)
@@ -50,7 +50,7 @@ def test_wave_is_the_one_of_the_reference_figures():
     drive = wave(3, 8, "grid")
     assert drive[0, 1, 2, 3] == pytest.approx(np.sin(0.3 + 1.4 + 3.3 + 2.0), abs=1e-6)
     for layout in ("image", "grid"):
-        field = patch_field(to_grid_indexing(wave(1, 8, layout), layout), 64, 45.0)  # RUN's muscles
+        field = patch_field(to_grid_layout(wave(1, 8, layout), layout), 64, 45.0)  # RUN's muscles
         assert torch.allclose(field[0, 0, :, 5], patch_field(drive[:1], 64, 45.0)[0, 0, :, 5], atol=1e-4)
         assert float(action_cost(field)) == pytest.approx(4115.537, rel=1e-5)
 

@@ -11,7 +11,7 @@ from baselines.modular.nodes import LENGTH_SCALE, SPEED_SCALE, Nodes, pack, unpa
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import place
-from dittogym.window import centre_in_window
+from dittogym.geometry import centre_in_window
 
 
 def segmented(task="run", num_envs=2, count=16, graph=True, **options):
@@ -132,7 +132,7 @@ def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task):
     values = torch.stack((torch.linspace(-1, 1, 16), torch.linspace(1, 0, 16)), -1)[None]
     action = env.nodes.to_grid(env.env, env.labels, values)
     state, spec = env.env.env_state, env.env.spec
-    centre = centre_in_window(spec.reach, state.centre, state.origin)
+    centre = centre_in_window(spec.patch_centre, state.centre, state.origin)
     field = place(action, centre, 128)
     robot = state.particles.x[:, : env.env.model.num_robot_particles]
     centres, _ = segment_means(robot, env.labels, 16)

@@ -65,11 +65,11 @@ def test_takes_over_constants_of_particles() -> None:
 
 def test_takes_over_memory_but_for_numbers_of_particles() -> None:
     large, small = make("grow", 400), make("grow", 100)
-    surrogate, tip = Surrogate(large, small), small.env_state.memory["tip"]
+    surrogate, tip = Surrogate(large, small), small.env_state.task_state["tip"]
     phase = torch.tensor([3, 4])
-    surrogate.sync(replace(large.env_state, memory={**large.env_state.memory, "phase": phase}))
-    assert torch.equal(small.env_state.memory["tip"], tip)
-    assert torch.equal(small.env_state.memory["phase"], phase)
+    surrogate.sync(replace(large.env_state, task_state={**large.env_state.task_state, "phase": phase}))
+    assert torch.equal(small.env_state.task_state["tip"], tip)
+    assert torch.equal(small.env_state.task_state["phase"], phase)
 
 
 def test_plans_are_tried_in_longer_substeps_and_carried_out_in_the_tasks_own() -> None:

@@ -19,7 +19,7 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.folder import policy_path
 from cfp.policy import describe_run
 from cfp.sections import EnvironmentConfig
-from dittogym.contract import Outcome
+from dittogym.rewards import Reward
 
 
 def make(task="run", stages=1, **changes):
@@ -31,8 +31,8 @@ def make(task="run", stages=1, **changes):
     return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
 
 
-def counting(moment, spec):
-    return Outcome({"far": (moment.now.com[:, 0] > moment.start.com[:, 0]).float()})
+def counting(transition, spec):
+    return Reward({"far": (transition.now.com[:, 0] > transition.start.com[:, 0]).float()})
 
 
 def test_a_reward_without_gradient_is_noticed(monkeypatch):
@@ -44,9 +44,9 @@ def test_a_reward_without_gradient_is_noticed(monkeypatch):
     assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
 
 
-def without_derivative(moment, spec):
-    x = moment.now.com[:, 0]
-    return Outcome({"far": (x - x.detach()).square().sqrt()})  # 0, and its derivative is NaN
+def without_derivative(transition, spec):
+    x = transition.now.com[:, 0]
+    return Reward({"far": (x - x.detach()).square().sqrt()})  # 0, and its derivative is NaN
 
 
 def test_gradients_that_are_never_finite_end_the_training(monkeypatch):
@@ -236,9 +236,9 @@ def test_a_trained_policy_is_kept_until_the_critic_has_learned():
 
 @pytest.mark.parametrize(("success", "expected"), [(True, 1.0), (False, 0.0)])
 def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, expected):
-    def ends_at_once(moment, spec):
-        over = torch.ones_like(moment.now.com[:, 0], dtype=torch.bool)
-        return Outcome(terms={}, terminated=over, success=over & success)
+    def ends_at_once(transition, spec):
+        over = torch.ones_like(transition.now.com[:, 0], dtype=torch.bool)
+        return Reward(terms={}, terminated=over, success=over & success)
 
     spec = replace(dittogym.make_spec("run"), reward_fn=ends_at_once, weights={"alive": 1.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
@@ -250,9 +250,9 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
 
 
 def test_gradients_that_are_not_finite_are_left_out_with_a_warning():
-    def rooted(moment, spec):
-        risen = moment.now.com[:, 1] - moment.start.com[:, 1]
-        return Outcome(terms={"risen": (risen * (risen > 0)).sqrt()})
+    def rooted(transition, spec):
+        risen = transition.now.com[:, 1] - transition.start.com[:, 1]
+        return Reward(terms={"risen": (risen * (risen > 0)).sqrt()})
 
     spec = replace(dittogym.make_spec("run"), reward_fn=rooted, weights={"risen": 1.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)

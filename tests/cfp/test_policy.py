@@ -18,7 +18,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import check_trained_for, describe_run, is_of_another_task, policy_file, write_policy
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from dittogym.action import trained_indexing
+from dittogym.action import trained_layout
 
 
 def images(count=3):
@@ -100,7 +100,7 @@ def test_policies_with_parity_in_their_header_load(tmp_path, environment, layout
     description["environment"] |= {"action_layout": None, **environment}
     write_policy(tmp_path / "policy.safetensors", actor.state_dict(), description)
     policy = cfp.load(tmp_path)
-    assert "parity" not in policy.description["environment"] and trained_indexing(policy) == layout
+    assert "parity" not in policy.description["environment"] and trained_layout(policy) == layout
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,7 @@ def test_an_episode_repeats_bit_by_bit(task: str) -> None:
 
 
 def test_what_cannot_be_deterministic_is_refused() -> None:
-    message = "deterministic=True needs device 'cpu' and a backend other than 'compile', got 'cpu' and 'compile'"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="deterministic=True"):
         tiny("run", deterministic=True, backend="compile")
     for backend in ("auto", "eager"):
         assert tiny("run", deterministic=True, backend=backend).num_particles == 120

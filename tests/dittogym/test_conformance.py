@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import dittogym
-from dittogym.reward_ops import action_cost
+from dittogym.rewards import action_cost
 
 #: task: (first robot particle, last object particle, sum of the occupancy channel of the first observation)
 LAYOUT = {

@@ -101,52 +101,24 @@ def test_disabled_autoreset_with_a_mask() -> None:
     assert np.array_equal(seen[0], rows[0][0][0]) and np.array_equal(seen[1], rows[2][0][1])
 
 
-@pytest.mark.parametrize("batch", [(), (2,)])
-def test_actions_of_another_resolution(batch: tuple[int, ...]) -> None:
-    env = make_vec() if batch else gymnasium.make("dittogym/run-coarse-v0", **SMALL).unwrapped
-    env.reset(seed=0)
-    for size, hint in (((64, 64), "; make the environment with resolution=64"), ((8, 9), ""), ((8,), "")):
-        with pytest.raises(ValueError, match=r"got float32 of shape \(.*\)" + hint + "$"):
-            env.step(np.zeros((*batch, 2, *size), np.float32))
-
-
-def test_a_reset_with_a_list_of_seeds_is_refused_and_changes_nothing() -> None:
-    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
-    before, _ = env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"seed must be a whole number, got \[5\]"):
-        env.reset(seed=[5])
-    assert np.array_equal(env.reset()[0], before)
-
-
-def test_seeds_in_an_array_are_those_of_a_list() -> None:
-    env = make_vec()
-    assert np.array_equal(env.reset(seed=np.array([3, 9]))[0], env.reset(seed=[3, 9])[0])
-
-
 def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+    with pytest.raises(ValueError, match="render_mode"):
         dittogym.Env("run", render_mode="ansi")
-    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array'"):
+    with pytest.raises(ValueError, match="render_mode"):
         make_vec(render_mode="human")
     monkeypatch.setitem(sys.modules, "pygame", None)
     monkeypatch.delitem(sys.modules, "dittogym.render.screen", raising=False)
-    with pytest.raises(ImportError, match=r"needs pygame: pip install 'torchmpm\[human\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'torchmpm\[human\]'"):
         dittogym.Env("run", render_mode="human")
 
 
-@pytest.mark.parametrize("task", ["kick", "catch"])
-def test_next_step_autoreset_with_reference_parity_looks_back_to_the_last_step(task: str) -> None:
-    """Not to one more step, which elements that have ended take with the others."""
-    options = {"max_episode_steps": 5, "parity": "reference"}
-    vector, single = make_vec(task, 1, **options), gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL, **options)
-    vector.reset(seed=0)
-    single.reset(seed=0)
+@pytest.mark.parametrize("resample", [False, True])
+def test_next_step_autoreset_is_a_reset_of_the_single_environment(resample: bool) -> None:
+    options = {"max_episode_steps": 3, "resample": resample}
+    vector, single = make_vec("catch", 1, **options), gymnasium.make("dittogym/catch-coarse-v0", **SMALL, **options)
+    seen, one = vector.reset(seed=np.array([3]))[0], single.reset(seed=3)[0]
     action = np.full((1, *single.action_space.shape), 0.5, np.float32)
-    for _ in range(5):
+    for t in range(7):
+        assert np.array_equal(seen[0], one)
         seen = vector.step(action)[0]
-        one = single.step(action[0])[0]
-    assert np.array_equal(seen[0], one)
-    seen, one = vector.step(action)[0], single.reset()[0]
-    assert np.array_equal(seen[0], one)
-    for _ in range(3):
-        assert np.array_equal(vector.step(action)[0][0], single.step(action[0])[0])
+        one = single.reset()[0] if t == 3 else single.step(action[0])[0]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from dittogym import observation as obs
 from dittogym.geometry import Box
-from dittogym.observation import raster as obs
-from dittogym.observation.image import encode
+from dittogym.observation import encode
 
 
 def loop_raster(position: np.ndarray, velocity: np.ndarray, row: int, column: int, mask: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from tiny import TASKS, tiny
 
 import dittogym
 from dittogym.core import StepResult, evaluate
-from dittogym.observation.image import silhouette
+from dittogym.observation import silhouette
 from torchmpm import ParticleState
 
 
@@ -21,7 +21,7 @@ def judge(
     tip: tuple[float, float] | None = None,
     speed: tuple[float, float] | None = None,
     spread: float | None = None,
-    memory: dict[str, float] | None = None,
+    task_state: dict[str, float] | None = None,
 ) -> StepResult:
     """What a task makes of a state: the initial one with bodies moved.
 
@@ -32,7 +32,7 @@ def judge(
         tip: Position of all particles of GROW's tip, m.
         speed: Velocity of everything, m/s.
         spread: Spread of the robot, m.
-        memory: Entries of the task's memory.
+        task_state: Entries of the task's state.
     """
     env = tiny(task, 1)
     env.reset(seed=0)
@@ -43,16 +43,16 @@ def judge(
         origin[:, 0] += robot[0]
     if spread is not None:
         centre = x[:, :count].mean(1, keepdim=True)
-        x[:, :count] = centre + (x[:, :count] - centre) * spread / state.start.split
+        x[:, :count] = centre + (x[:, :count] - centre) * spread / state.start.radius_of_gyration
     if cube is not None:
         x[:, count:] += torch.tensor(cube) - x[:, count:].mean(1)
     if tip is not None:
-        x[0, state.memory["tip"][0]] = torch.tensor(tip, dtype=x.dtype)
+        x[0, state.task_state["tip"][0]] = torch.tensor(tip, dtype=x.dtype)
     if speed is not None:
         v[:] = torch.tensor(speed)
-    entries = {name: torch.full_like(state.memory[name], value) for name, value in (memory or {}).items()}
+    entries = {name: torch.full_like(state.task_state[name], value) for name, value in (task_state or {}).items()}
     particles = ParticleState(x, v, old.C, old.F, old.Jp)
-    state = replace(state, particles=particles, origin=origin, memory={**state.memory, **entries})
+    state = replace(state, particles=particles, origin=origin, task_state={**state.task_state, **entries})
     return evaluate(env.model, state, torch.zeros(1, 2, env.spec.patch, env.spec.patch, dtype=env.dtype))
 
 
@@ -140,8 +140,8 @@ def test_a_torn_robot_ends_the_episode(task: str) -> None:
         ("catch", {"cube": (0.35, 0.35)}, "object_distance", 50 * -0.3),
         ("catch", {"cube": (0.45, 0.95)}, "object_distance", 50 * -0.5),
         ("catch", {"cube": (-0.4, 0.9)}, "hand_distance", 30 * -0.5),
-        ("slot", {"memory": {"front_distance": 9.0}}, "approach", 2 * 50.0),
-        ("slot", {"memory": {"front_distance": -9.0}}, "approach", 2 * -20.0),
+        ("slot", {"task_state": {"front_distance": 9.0}}, "approach", 2 * 50.0),
+        ("slot", {"task_state": {"front_distance": -9.0}}, "approach", 2 * -20.0),
         ("slot", {"cube": (0.635, 0.337)}, "object_location", 2 * 10.0),
         ("slot", {"cube": (0.68, 0.23)}, "fall", 2 * 100.0),
         ("slot", {"cube": (0.66, 0.23)}, "fall", 2 * -100.0),

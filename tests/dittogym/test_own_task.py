@@ -5,7 +5,7 @@ import hashlib
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,12 +18,11 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tiny import SMALL, actions, assert_same_bits, everything, make_vec, tiny
 
 import dittogym
-from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
-from dittogym.contract import Moment, Outcome
-from dittogym.geometry import ceiling, floor, solid
+from dittogym.bodies.shapes import Disc, Figure, Rectangle
+from dittogym.geometry import Window, ceiling, floor, solid
+from dittogym.rewards import Reward, Transition
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks import fingerprint, headline
-from dittogym.window import Window
 from torchmpm import Elastic, Snow, VelocityRule
 
 
@@ -39,9 +38,9 @@ def unregister() -> Iterator[None]:
 
 
 # A task in about ten lines: get high above the start.
-def height(moment: Moment, spec: TaskSpec) -> Outcome:
-    risen = moment.now.com[:, 1] - moment.start.com[:, 1]
-    return Outcome({"height": risen}, terminated=risen > 0.3, success=risen > 0.2)
+def height(transition: Transition, spec: TaskSpec) -> Reward:
+    risen = transition.now.com[:, 1] - transition.start.com[:, 1]
+    return Reward({"height": risen}, terminated=risen > 0.3, success=risen > 0.2)
 
 
 def hop(pull: float = -5.0, horizon: int = 40, coarse: int = 4) -> TaskSpec:
@@ -52,6 +51,10 @@ def hop(pull: float = -5.0, horizon: int = 40, coarse: int = 4) -> TaskSpec:
     return TaskSpec("hop", horizon, robot, reward_fn=height, weights=weights, **matter, **world)
 
 
+def changed(**changes: object) -> TaskSpec:
+    return dataclasses.replace(hop(), **changes)
+
+
 def test_through_gymnasium_make_in_both_resolutions() -> None:
     dittogym.register("hop", hop)
     for resolution, size in (("coarse", 4), ("fine", 8)):
@@ -59,8 +62,6 @@ def test_through_gymnasium_make_in_both_resolutions() -> None:
         assert gymnasium.spec(name).max_episode_steps == 40
         env = gymnasium.make(name, **SMALL)
         assert env.action_space.shape == (2, size, size)
-        env.reset(seed=0)
-        assert env.unwrapped.torch_env.spec.name == "hop"
         check_env(gymnasium.make(name, render_mode="rgb_array", **SMALL).unwrapped)
         check_env_sb3(gymnasium.make(name, **SMALL))
 
@@ -73,8 +74,7 @@ def test_its_own_reward_term_ending_and_success() -> None:
     _, reward, terminated, _, info = env.step(still)
     terms = {name: value for name, value in info.items() if name.startswith("reward_terms/")}
     assert set(terms) == {f"reward_terms/{name}" for name in ("height", "action", "alive", "failure")}
-    risen = info["com"][1] - start["com"][1]
-    assert terms["reward_terms/height"] == pytest.approx(7.0 * risen, abs=1e-6)
+    assert terms["reward_terms/height"] == pytest.approx(7.0 * (info["com"][1] - start["com"][1]), abs=1e-6)
     assert reward == pytest.approx(sum(terms.values()), abs=1e-5)
     assert terminated is False and not info["is_success"]
     for lift, wanted in ((0.25, (False, True)), (0.1, (True, True))):
@@ -83,37 +83,42 @@ def test_its_own_reward_term_ending_and_success() -> None:
         assert (terminated, info["is_success"]) == wanted
 
 
-def test_through_make_vec_and_torch() -> None:
-    dittogym.register("hop", hop)
-    env = make_vec("hop", 3, autoreset_mode="SameStep")
-    single = gymnasium.make("dittogym/hop-coarse-v0", **SMALL)
-    env.reset(seed=0)
-    single.reset(seed=2)
-    env.action_space.seed(0)
-    action = env.action_space.sample()
-    assert action.shape == (3, 2, 4, 4)
-    observation, reward, _, _, info = env.step(action)
-    seen, one, *_ = single.step(action[2])
-    assert np.array_equal(observation[2], seen) and reward[2] == pytest.approx(one, abs=1e-5)
-    assert info["reward_terms/height"].shape == (3,)
-    env.unwrapped.state.x[1, :, 1] += 0.35
-    _, _, terminated, _, info = env.step(action)
+def test_a_specification_needs_no_registration() -> None:
+    check_env(dittogym.Env(hop(), particles=50, substeps=1), skip_render_check=True)
+    batch = dittogym.BatchEnv(hop(), 3, autoreset_mode="SameStep", **SMALL)
+    batch.reset(seed=0)
+    batch.state.x[1, :, 1] += 0.35
+    *_, terminated, _, info = batch.step(np.zeros((3, 2, 4, 4), np.float32))
     assert terminated.tolist() == [False, True, False] and info["final_info"]["is_success"][1]
-    assert tiny("hop").spec.name == "hop" and dittogym.Env("hop", **SMALL).action_space.shape == (2, 4, 4)
 
 
 def test_options_of_the_function_arrive() -> None:
     dittogym.register("hop", hop)
     env = gymnasium.make("dittogym/hop-coarse-v0", pull=-1.5, coarse=6, body=Disc((0.4, 0.16), 0.1), **SMALL)
-    assert env.unwrapped.torch_env.spec.gravity == (0.0, -1.5)
-    assert env.action_space.shape == (2, 6, 6)
-    assert env.unwrapped.torch_env.spec.robot.shape.size == (0.1, 0.1)
-    assert tiny("hop", pull=-2.0).spec.gravity == (0.0, -2.0)
-    message = "task 'hop' got an unexpected keyword argument 'push'; its options are body, obstacles, pull"
-    with pytest.raises(TypeError, match=message):
+    spec = env.unwrapped.torch_env.spec
+    assert (spec.gravity, spec.robot.shape.size, env.action_space.shape) == ((0.0, -1.5), (0.1, 0.1), (2, 6, 6))
+    with pytest.raises(TypeError, match="'push'; its options are body, obstacles, pull"):
         gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
-    with pytest.raises(ValueError, match=r"task must be one of catch, .*, hop, .* got 'hope'"):
-        tiny("hope")
+    single, batch = gymnasium.make("dittogym/hop-coarse-v0", horizon=3, **SMALL), make_vec("hop", horizon=3)
+    single.reset(seed=0), batch.reset(seed=0)
+    assert [single.step(np.zeros((2, 4, 4), np.float32))[3] for _ in range(3)] == [False, False, True]
+    assert [batch.step(np.zeros((2, 2, 4, 4), np.float32))[3].tolist() for _ in range(3)][2] == [True, True]
+
+    def stretched(horizon: int = 30, **others: float):
+        return dataclasses.replace(hop(), name="stretched", horizon=horizon, **others)
+
+    dittogym.register("stretched", stretched)
+    spec = dittogym.make_spec("stretched", horizon=40, mu=900.0)
+    assert (spec.horizon, spec.mu) == (40, 900.0)
+
+
+def test_a_longer_limit_than_the_horizon() -> None:
+    env = gymnasium.make("dittogym/shapematch-coarse-v0", max_episode_steps=32, particles=20, substeps=1)
+    own = dittogym.Env("shapematch", particles=20, substeps=1)
+    for each, limit in ((env, 32), (own, 30)):
+        each.reset(seed=0)
+        limits = [each.step(np.zeros(each.action_space.shape, np.float32))[3] for _ in range(limit)]
+        assert limits == [False] * (limit - 1) + [True]
 
 
 def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypatch) -> None:
@@ -124,37 +129,19 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
         "dittogym.register('leap', leap)"
     )
     (tmp_path / "torn.py").write_text("1 / 0")
-    (tmp_path / "lame.py").write_text("\nimport absent_one")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "hidden.py").write_text("raise AssertionError('is never imported')")
-    env = tiny("hopping:leap", substeps=1)
-    assert (env.spec.name, env.spec.horizon) == ("leap", dittogym.make_spec("run").horizon)
+    assert tiny("hopping:leap", substeps=1).spec.name == "leap"
     for task, reason in (
-        ("hopping:fly", "module 'hopping' does not register 'fly'"),
-        ("torn:leap", "module 'torn': torn.py, line 1, ZeroDivisionError: division by zero"),
-        ("lame:leap", "module 'lame': lame.py, line 2, ModuleNotFoundError: No module named 'absent_one'"),
-        ("missing_one:leap", "there is no module 'missing_one' in the working directory or on the Python path"),
-        ("folder.hidden:leap", "the name of a module must be a word, without dots"),
-        (":leap", "the name of a module must be a word"),
-        ("folder:leap", "module 'folder' is a folder, not a file"),
+        ("hopping:fly", "does not register 'fly'"),
+        ("torn:leap", "ZeroDivisionError"),
+        ("missing_one:leap", "No module named 'missing_one'"),
+        ("folder.hidden:leap", "without dots"),
+        ("folder:fly", "does not register 'fly'"),
+        ("hope", "got 'hope'"),
     ):
-        with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME \({reason}.* got '{task}'"):
+        with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME.*{reason}"):
             dittogym.make_spec(task)
-
-
-def test_the_name_is_that_of_the_specification() -> None:
-    with pytest.raises(ValueError, match="task must be the name in the specification, got 'leap' for a TaskSpec 'hop'"):
-        dittogym.register("leap", hop)
-    assert "leap" not in dittogym.TASKS
-
-
-def test_namespace_and_versions() -> None:
-    for version in (0, 1):
-        dittogym.register("hop", hop, version=version)
-    assert {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1"} <= set(gymnasium.registry)
-    dittogym.register("hop", hop, namespace="mine", version=3)
-    assert {"mine/hop-coarse-v3", "mine/hop-fine-v3"} <= set(gymnasium.registry)
-    assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
 
 
 def test_another_process_makes_the_task_from_its_specification(tmp_path: Path) -> None:
@@ -175,92 +162,62 @@ def test_another_process_makes_the_task_from_its_specification(tmp_path: Path) -
     assert text == "TorchEnv('jump', 1, 8, device='cpu')\n"
 
 
-def test_a_taken_name_is_refused() -> None:
-    dittogym.register("hop", hop)
-    before = dict(dittogym.TASKS), set(gymnasium.registry)
-    for name in ("run", "hop"):
-        with pytest.raises(ValueError, match=f"task must be a new name, got '{name}', which is taken"):
-            dittogym.register(name, lambda: hop())
-    assert (dict(dittogym.TASKS), set(gymnasium.registry)) == before
+def test_names_namespaces_and_versions() -> None:
+    for version in (0, 1):
+        dittogym.register("hop", hop, version=version)
+    dittogym.register("hop", hop, namespace="mine", version=3)
+    ids = {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1", "mine/hop-coarse-v3", "mine/hop-fine-v3"}
+    assert ids <= set(gymnasium.registry)
+    assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
+    assert headline("hop") == headline("module:hop") == ("hop", "")
+    assert headline("shapematch") == ("SHAPE MATCH", "Take the shape of a picture, without gravity.")
+    assert fingerprint("run") is None
+    assert fingerprint("hop") == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+
+
+def test_the_later_registration_wins() -> None:
+    """As when a cell of a notebook is run twice; the names of the library's tasks stay theirs."""
+    for horizon in (40, 20):
+        dittogym.register("hop", lambda horizon=horizon: hop(horizon=horizon))
+        assert gymnasium.spec("dittogym/hop-coarse-v0").max_episode_steps == horizon == tiny("hop").spec.horizon
+    with pytest.raises(ValueError, match="task must be a name that no task of the library has, got 'run'"):
+        dittogym.register("run", hop)
     assert tiny("run").spec.name == "run"
 
 
 @pytest.mark.parametrize(
-    ("make", "options", "error", "message"),
+    ("make", "options", "error", "argument"),
     [
-        (5, {}, TypeError, "make must be a function that returns a TaskSpec, got int"),
-        (lambda pull, *, size, **rest: hop(), {}, TypeError, "make must have defaults for .* got none for pull, size$"),
-        (lambda particles=3, body=None: hop(), {}, ValueError, "make must have .* other names .* got body, particles$"),
-        (hop, {"version": -1}, ValueError, "version must not be negative, got -1"),
-        (hop, {"version": "1"}, ValueError, "version must be a whole number, got '1'"),
+        (5, {}, TypeError, "make"),
+        (hop(), {}, TypeError, "make"),
+        (lambda: None, {}, TypeError, "make must return a TaskSpec"),
+        (lambda pull, *, size, **rest: hop(), {}, TypeError, "make .* got none for pull, size$"),
+        (lambda particles=3, body=None: hop(), {}, ValueError, "make .* got body, particles$"),
+        (dittogym.TASKS["run"], {}, ValueError, "task must be the name in the specification"),
+        (hop, {"version": -1}, ValueError, "version"),
+        (hop, {"version": "1"}, ValueError, "version"),
     ],
 )
-def test_what_cannot_be_registered(make: object, options: dict, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
+def test_what_cannot_be_registered(make: object, options: dict, error: type, argument: str) -> None:
+    with pytest.raises(error, match=argument):
         dittogym.register("hop", make, **options)
-    assert "hop" not in dittogym.TASKS
-    dittogym.register("hop", lambda *args, **options: hop())
-
-
-@pytest.mark.parametrize(("result", "kind"), [(None, "NoneType"), ({"name": "hop"}, "dict"), (TaskSpec, "type")])
-def test_a_function_that_returns_something_else_is_refused(result: object, kind: str) -> None:
-    with pytest.raises(TypeError, match=f"make must return a TaskSpec, got {kind}"):
-        dittogym.register("hop", lambda: result)
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
-    with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got TaskSpec"):
-        dittogym.register("hop", hop())
 
 
-def test_a_specification_is_no_name_of_a_task() -> None:
-    with pytest.raises(ValueError, match=r"dittogym\.register knows the function .*, got the TaskSpec 'hop' itself"):
-        dittogym.tasks.check_task(hop())
+def test_state_of_a_task_and_objects() -> None:
+    """The highest point so far is remembered by each element until its own reset, in any kind of mapping."""
 
+    def initial_peak(transition: Transition, spec: TaskSpec) -> MappingProxyType:
+        return MappingProxyType({"peak": transition.start.com[:, 1]})
 
-def test_a_specification_needs_no_registration() -> None:
-    env = dittogym.Env(hop(), particles=50, substeps=1)
-    check_env(env, skip_render_check=True)
-    assert dittogym.BatchEnv(hop(), 2, particles=50, substeps=1).single_action_space.shape == (2, 4, 4)
+    def peak_reward(transition: Transition, spec: TaskSpec) -> Reward:
+        peak = torch.maximum(transition.task_state["peak"], transition.now.com[:, 1])
+        info = {"peak": peak, "stone": transition.object_com}
+        return Reward({"peak": peak - transition.start.com[:, 1]}, info=info, task_state={"peak": peak})
 
-
-def initial_peak(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
-    return {"peak": moment.now.com[:, 1]}
-
-
-def peak_reward(moment: Moment, spec: TaskSpec) -> Outcome:
-    peak = torch.maximum(moment.memory["peak"], moment.now.com[:, 1])
-    assert moment.now.object_com is not None
-    return Outcome(
-        {"peak": peak - moment.start.com[:, 1]},
-        info={"peak": peak, "stone": moment.now.object_com},
-        memory={"peak": peak},
-    )
-
-
-def test_a_memory_that_is_no_dict_is_reset_in_part() -> None:
-    """It may be any mapping."""
-    spec = dataclasses.replace(
-        hop(),
-        initial_memory=lambda moment, spec: MappingProxyType({"peak": moment.now.com[:, 1]}),
-    )
-    env = tiny(spec, 2)
-    env.reset(seed=0)
-    positions, before = env.state.x.clone(), env.env_state.memory["peak"].clone()
-    positions[..., 1] += 0.1
-    env.reset(options={"positions": positions, "reset_mask": [False, True]})
-    assert (env.env_state.memory["peak"] - before).tolist() == pytest.approx([0.0, 0.1])
-
-
-def test_memory_and_objects_of_a_task_of_ones_own() -> None:
-    """The highest point so far is remembered by each element until its own reset."""
     stone = BodySpec(Rectangle((0.7, 0.16), (0.06, 0.06)), count=500, mass=4.0)
-    spec = dataclasses.replace(
-        hop(),
-        objects=(stone,),
-        initial_memory=initial_peak,
-        reward_fn=peak_reward,
-        weights={"peak": 7.0},
-        gravity=(0.0, 0.0),
-    )
+    functions = {"initial_task_state": initial_peak, "reward_fn": peak_reward}
+    spec = changed(objects=(stone,), weights={"peak": 7.0}, gravity=(0.0, 0.0), **functions)
     env = tiny(spec, 2, particles=(100, 30))
     env.reset(seed=0)
     start = env.state.x[:, :100, 1].mean(1)
@@ -277,30 +234,18 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     info = env.step(still)[-1]
     assert info["reward_terms"]["peak"].tolist() == pytest.approx([0.0, 1.4], abs=1e-2)
     assert "is_success" not in info
-
-
-def test_a_reset_of_some_elements_leaves_the_others_alone() -> None:
-    """Only the positions and images of the elements that are reset are computed."""
-    sizes = []
-
-    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
-        sizes.append((len(moment.particles.x), len(moment.observation)))
-        return {"start": moment.now.com}
-
-    env = tiny(dataclasses.replace(hop(), initial_memory=memory), 3)
     env.reset(seed=0)
-    env.reset(options={"reset_mask": [False, True, False]})
-    assert sizes == [(3, 3), (1, 1)]
+    env.env_state.task_state["peak"].zero_()  # a copy
+    assert env.env_state.start.com.all()
 
 
 def test_a_reset_that_fails_changes_nothing() -> None:
     working = True
 
-    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
-        return {"start": moment.now.com} if working else {}["missing"]
+    def remembered(transition: Transition, spec: TaskSpec) -> dict[str, torch.Tensor]:
+        return {"start": transition.now.com} if working else {}["missing"]
 
-    spec = dataclasses.replace(hop(), initial_memory=memory)
-    env, untouched = (tiny(spec, 2, resample=True) for _ in range(2))
+    env, untouched = (tiny(changed(initial_task_state=remembered), 2, resample=True) for _ in range(2))
     env.reset(seed=0), untouched.reset(seed=0)
     before, working = everything(env), False
     for options in ({"physics": {"mu": 100.0}}, {"positions": env.state.x + 0.01}, {"reset_mask": [True, False]}):
@@ -312,281 +257,114 @@ def test_a_reset_that_fails_changes_nothing() -> None:
     assert_same_bits(everything(env), everything(untouched))
 
 
-def test_weights_name_every_term() -> None:
-    env = tiny(dataclasses.replace(hop(), weights={"heigth": 7.0}))
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"weights of task 'hop' must hold every term .* got none for \['height'\]"):
-        env.step(actions(env, 1)[0])
-    env = tiny(dataclasses.replace(hop(), weights={"height": 7.0, "alve": 1.0}))
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"weights of task 'hop' must be of the terms .* got \['alve'\]"):
-        env.step(actions(env, 1)[0])
-
-
 def test_a_term_in_double_precision_leaves_that_of_the_reward() -> None:
-    def precise(moment: Moment, spec: TaskSpec) -> Outcome:
-        return Outcome({"height": moment.now.com[:, 1].double()})
+    def precise(transition: Transition, spec: TaskSpec) -> Reward:
+        return Reward({"height": transition.now.com[:, 1].double()})
 
-    env = tiny(dataclasses.replace(hop(), reward_fn=precise), dtype="float32")
+    env = tiny(changed(reward_fn=precise), dtype="float32")
     env.reset(seed=0)
     _, reward, _, _, info = env.step(actions(env, 1)[0])
     assert reward.dtype == info["reward_terms"]["height"].dtype == torch.float32
 
 
-@pytest.mark.parametrize("task", ["grow", "dig", "catch"])
+@pytest.mark.parametrize("task", ["grow", "dig", "catch", "shapematch"])
 def test_a_goal_that_is_replaced_is_rewarded_and_marked(task: str) -> None:
     spec = dittogym.make_spec(task)
-    far = dataclasses.replace(spec, goal=(spec.goal[0] + 0.2, spec.goal[1]))
-    results = []
-    for each in (spec, far):
+    other = {"target": ~spec.target} if spec.goal is None else {"goal": (spec.goal[0] + 0.2, spec.goal[1])}
+    images, rewards = [], []
+    for each in (spec, dataclasses.replace(spec, **other)):
         env = tiny(each)
-        observation = env.reset(seed=0)[0]
-        results.append((observation, env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[1]))
-    assert not torch.equal(results[0][0], results[1][0]) and not torch.equal(results[0][1], results[1][1])
-
-
-def test_a_target_that_is_replaced_is_rewarded() -> None:
-    spec = dittogym.make_spec("shapematch")
-    envs = [tiny(each) for each in (dataclasses.replace(spec, target=~spec.target), spec)]
-    mismatch = []
-    for env in envs:
-        env.reset(seed=0)
-        mismatch.append(float(env.step(actions(env, 1)[0])[-1]["reward_terms"]["mismatch"]))
-    assert sum(mismatch) == pytest.approx(-0.1 * 64 * 64)  # each pixel differs from one of the two
-
-
-@pytest.mark.parametrize(
-    ("remembered", "error", "message"),
-    [
-        ("peak", TypeError, "initial_memory must be a function of a Moment and a TaskSpec, got 'peak'"),
-        (lambda moment, spec: None, TypeError, "initial_memory of task 'hop' must return .* by name, got NoneType"),
-        (lambda moment, spec: {"peak": 1.0}, ValueError, r"memory of shape \(B, ...\), got float for 'peak'"),
-    ],
-)
-def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        tiny(dataclasses.replace(hop(), initial_memory=remembered)).reset(seed=0)
-
-
-def test_names_that_a_reset_cannot_leave_stale_are_refused() -> None:
-    spec = dataclasses.replace(hop(), initial_memory=initial_peak, stale_memory=("summit",))
-    with pytest.raises(ValueError, match=r"stale_memory names, got \['peak'\] without \['summit'\]"):
-        tiny(spec).reset(seed=0)
-    with pytest.raises(TypeError, match="stale_memory must be a sequence of str, got 'summit'"):
-        dataclasses.replace(hop(), stale_memory="summit")
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_term_that_is_not_finite_is_named(value: float) -> None:
-    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
-        broken = torch.where(moment.now.com[:, 1] > 10.0, 0.0, value)
-        return Outcome({"height": moment.now.split, "way": broken})
-
-    env = tiny(dataclasses.replace(hop(), reward_fn=reward_fn, weights={"height": 1.0, "way": 1.0}), 2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=f"must return finite terms .* got {value} for 'way' in simulation 0"):
-        env.step(torch.zeros(2, *env.action_shape))
-    env.state.x[0] = torch.nan  # a simulation that is not finite may be judged as it likes
-    with pytest.raises(ValueError, match="for 'way' in simulation 1"):
-        env.step(torch.zeros(2, *env.action_shape))
-
-
-def test_the_fingerprint_is_that_of_the_task_s_file(tmp_path, monkeypatch) -> None:
-    assert fingerprint("run") is None
-    dittogym.register("hop", hop)
-    assert fingerprint("hop") == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
-    space = {"dittogym": dittogym, "hop": hop}
-    exec("def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump'})", space)
-    dittogym.register("jump", space["jump"])
-    assert fingerprint("jump") is None
-
-
-def test_a_longer_limit_than_the_horizon() -> None:
-    env = gymnasium.make("dittogym/shapematch-coarse-v0", max_episode_steps=32, particles=20, substeps=1)
-    env.reset(seed=0)
-    limits = [env.step(np.zeros(env.action_space.shape, np.float32))[3] for _ in range(32)]
-    assert limits == [False] * 31 + [True]
-    own = dittogym.Env("shapematch", particles=20, substeps=1)
-    own.reset(seed=0)
-    assert [own.step(np.zeros(own.action_space.shape, np.float32))[3] for _ in range(30)] == [False] * 29 + [True]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, r"terminated as bool of shape \(B,\), got torch.bool of"),
-        ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32 of shape \(2,\)"),
-        ({"terms": {"height": torch.zeros(3)}}, r"terms of shape \(B,\) .* of shape \(3,\) for 'height'"),
-        (
-            {"terms": {"height": torch.zeros(2) * 1j}},
-            r"terms of shape \(B,\) in real numbers, got torch.complex64 of",
-        ),
-        ({"terms": {"alive": torch.zeros(2)}}, r"must not return the environment's own terms, got \['alive'\]"),
-        ({"info": {"com": torch.zeros(2)}}, r"must not return the environment's own info, got \['com'\]"),
-        ({"info": {"episode": torch.zeros(2)}}, r"must not return the environment's own info, got \['episode'\]"),
-        ({"info": {"_risen": torch.zeros(2)}}, r"names that do not begin with _ or reward_terms/, got '_risen'"),
-        ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
-        ({"memory": {"best": torch.zeros(2)}}, r"like that of initial_memory, {'first': .*got {'best': 'torch"),
-        ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
-    ],
-)
-def test_an_outcome_that_would_do_harm_later_is_refused(changes: dict, message: str) -> None:
-    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
-        return height(moment, spec)._replace(**changes)
-
-    spec = dataclasses.replace(
-        hop(), reward_fn=reward_fn, initial_memory=lambda moment, spec: {"first": moment.now.com}
-    )
-    env = tiny(spec, 2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        env.step(actions(env, 1)[0])
-
-
-def test_an_outcome_is_checked_in_every_step() -> None:
-    """Also where the names are those of the step before."""
-    width = 2
-    spec = dataclasses.replace(
-        hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(info={"risen": torch.zeros(width)})
-    )
-    env = tiny(spec, 2)
-    env.reset(seed=0)
-    env.step(actions(env, 1)[0])
-    width = 1
-    with pytest.raises(ValueError, match=r"must return info of shape \(B, ...\), got .* of shape \(1,\)"):
-        env.step(actions(env, 1)[0])
-
-
-def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
-    dittogym.register("hop", hop)
-    single = gymnasium.make("dittogym/hop-coarse-v0", horizon=3, **SMALL)
-    batch = make_vec("hop", horizon=3)
-    single.reset(seed=0)
-    batch.reset(seed=0)
-    ends = [single.step(np.zeros((2, 4, 4), np.float32))[3] for _ in range(3)]
-    assert ends == [False, False, True]
-    assert [batch.step(np.zeros((2, 2, 4, 4), np.float32))[3].tolist() for _ in range(3)][2] == [True, True]
-
-
-def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> None:
-    gymnasium.register("mine/hop-v0", "dittogym.env:Env", kwargs={"task": hop()})  # by hand, and left alone
-    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump', 'horizon': %d})"
-    for horizon in (40, 20):
-        names = {"dittogym": dittogym, "hop": hop, "__name__": "notebook"}
-        exec(cell % horizon, names)
-        dittogym.register("jump", names["jump"])
-    assert gymnasium.spec("dittogym/jump-coarse-v0").max_episode_steps == 20 and "mine/hop-v0" in gymnasium.registry
-    assert tiny("jump").spec.horizon == 20
-    exec(cell % 10, names)
-    dittogym.register("jump", names["jump"], version=1)
-    assert "dittogym/jump-coarse-v1" in gymnasium.registry and "dittogym/jump-coarse-v0" not in gymnasium.registry
+        images.append(env.reset(seed=0)[0])
+        rewards.append(env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[1])
+    assert torch.equal(*images) is (spec.goal is None) and not torch.equal(*rewards)
 
 
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"max_actuation": -5.0}, ValueError, "max_actuation must not be negative, got -5.0"),
-        ({"goal": (1.0, 2.0, 3.0)}, ValueError, r"goal must be two numbers \(x, y\), got \(1.0, 2.0, 3.0\)"),
-        ({"reach": (None, "up")}, ValueError, "reach y must be a number, got 'up'"),
-        ({"reach": (None, 5.0)}, ValueError, r"reach must be 0 to 1 m from the lower left corner .* got \(None, 5.0\)"),
-        ({"view": (-0.1, 0.5)}, ValueError, r"view must be 0 to 1 m from the lower left corner .* got \(-0.1, 0.5\)"),
-        (
-            {"target": np.zeros((3, 3), bool)},
-            ValueError,
-            r"target must be bool of shape \(64, 64\), got bool of shape \(3, 3\)",
-        ),
-        ({"weights": {"action": -2e-4}}, ValueError, r"weights\['action'\] must not be negative, got -0.0002"),
-        ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
-        ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
-        ({"coarse": 16}, ValueError, "coarse must be at most fine, 8, got 16"),
-        ({"obstacles": floor()}, TypeError, "obstacles must be a sequence of Obstacle, got Obstacle"),
+        (None, TypeError, "return a Reward, got NoneType"),
+        ({"terms": None}, TypeError, "terms by name"),
+        ({"info": [1]}, TypeError, "info by name"),
+        ({"task_state": torch.zeros(1)}, TypeError, "task_state by name"),
+        ({"terms": {"height": torch.zeros(3)}}, ValueError, r"terms of shape \(B,\) .* for 'height'"),
+        ({"terms": {"height": torch.zeros(2) * 1j}}, ValueError, "real numbers"),
+        ({"terms": {"alive": torch.zeros(2)}}, ValueError, r"own terms, got \['alive'\]"),
+        ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, ValueError, "terminated as bool"),
+        ({"success": torch.zeros(2)}, ValueError, "success as bool"),
+        ({"info": {"com": torch.zeros(2)}}, ValueError, r"own info, got \['com'\]"),
+        ({"info": {"_risen": torch.zeros(2)}}, ValueError, "got '_risen'"),
+        ({"info": {"risen": 1.0}}, ValueError, "for 'risen'"),
+        ({"task_state": {"best": torch.zeros(2)}}, ValueError, "like initial_task_state"),
+        ({"task_state": {"first": torch.zeros(2)}}, ValueError, "like initial_task_state"),
+    ],
+)
+def test_a_reward_function_is_tried_when_an_environment_is_made(
+    changes: dict | None, error: type, message: str
+) -> None:
+    def reward_fn(transition: Transition, spec: TaskSpec) -> Reward | None:
+        return None if changes is None else height(transition, spec)._replace(**changes)
+
+    functions = {"reward_fn": reward_fn, "initial_task_state": lambda transition, spec: {"first": transition.now.com}}
+    with pytest.raises(error, match=f"reward_fn of task 'hop' must .*{message}"):
+        tiny(changed(**functions), 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"weights": {"heigth": 7.0}}, ValueError, r"weights of task 'hop' .* got none for \['height'\]"),
+        ({"weights": {"height": 7.0, "alve": 1.0}}, ValueError, r"weights of task 'hop' .* got \['alve'\]"),
+        ({"initial_task_state": lambda transition, spec: None}, TypeError, "initial_task_state of task 'hop'"),
+        ({"initial_task_state": lambda transition, spec: {"peak": 1.0}}, ValueError, "float for 'peak'"),
+        ({"split_limit": 0.05}, ValueError, "robot must be more compact"),
+        ({"robot": BodySpec(Rectangle((0.9, 0.2), (0.3, 0.1)), 100)}, ValueError, "robot must lie inside the window"),
+        ({"robot": BodySpec(Rectangle((0.05, 0.1), (0.1, 0.1)), 100)}, ValueError, "robot .* the obstacle 'floor'"),
+        ({"objects": (BodySpec(Disc((0.17, 0.02), 0.06), 100),)}, ValueError, r"objects\[0\] .* 'floor'"),
+        ({"objects": (BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)}, ValueError, r"objects\[0\] .* the window"),
+    ],
+)
+def test_a_task_that_cannot_start_is_refused(changes: dict, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        tiny(changed(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"max_actuation": -5.0}, ValueError, "max_actuation"),
+        ({"goal": (1.0, 2.0, 3.0)}, ValueError, "goal"),
+        ({"patch_centre": (None, "up")}, ValueError, "patch_centre y"),
+        ({"patch_centre": (None, 5.0)}, ValueError, "patch_centre"),
+        ({"view": (-0.1, 0.5)}, ValueError, "view"),
+        ({"target": np.zeros((3, 3), bool)}, ValueError, "target"),
+        ({"weights": {"action": -2e-4}}, ValueError, r"weights\['action'\]"),
+        ({"weights": 1.0}, TypeError, "weights"),
+        ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\]"),
+        ({"obstacles": floor()}, TypeError, "obstacles"),
+        ({"coarse": 16}, ValueError, "coarse"),
+        ({"initial_task_state": "peak"}, TypeError, "initial_task_state must be a function"),
     ],
 )
 def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
-        dataclasses.replace(hop(), **changes)
+        changed(**changes)
 
 
-def test_a_robot_outside_its_window_is_refused() -> None:
-    wide = BodySpec(Rectangle((0.9, 0.2), (0.3, 0.1)), count=100)
-    with pytest.raises(ValueError, match="robot must lie inside the window"):
-        tiny(dataclasses.replace(hop(), robot=wide, window=Window(left=0.0)))
-
-
-def test_a_robot_inside_an_obstacle_is_refused() -> None:
-    low = BodySpec(Rectangle((0.05, 0.1), (0.1, 0.1)), count=100)
-    with pytest.raises(ValueError, match="robot must start outside the obstacle 'floor'"):
-        tiny(dataclasses.replace(hop(), robot=low))
-
-
-@pytest.mark.parametrize(
-    ("shape", "obstacles", "message"),
-    [
-        (Disc((0.17, 0.02), 0.06), (floor(),), r"objects\[0\] must start outside the obstacle 'floor' .* 0.020 < y"),
-        (Disc((0.7, 0.3), 0.1), (solid("box", (94, 98), (None, 60)),), r"objects\[0\] must start outside .* 'box'"),
-        (Rectangle((0.9, 0.3), (0.2, 0.1)), (), r"objects\[0\] must lie inside the window .* got 0.900 < x < 1.100"),
-    ],
-)
-def test_an_object_outside_its_window_or_in_an_obstacle_is_refused(shape, obstacles: tuple, message: str) -> None:
-    spec = dataclasses.replace(hop(), objects=(BodySpec(shape, count=1000),))
-    with pytest.raises(ValueError, match=message):
-        tiny(dataclasses.replace(spec, obstacles=obstacles))
-
-
-def test_a_robot_that_counts_as_torn_from_the_start_is_refused() -> None:
-    with pytest.raises(ValueError, match="robot must be more compact"):
-        tiny(dataclasses.replace(hop(), split_limit=0.05))
-
-
-def test_a_robot_of_another_material_and_size() -> None:
+def test_a_robot_of_another_material() -> None:
+    """Constants that no body takes are refused; of those that the object alone takes there is a warning."""
     robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0), lite=100)
-    elastic = tiny(dataclasses.replace(hop(), robot=robot), particles="lite", substeps=20)
-    own = tiny(hop(), particles=100, substeps=20)
+    elastic, own = tiny(changed(robot=robot), particles="lite", substeps=20), tiny(hop(), particles=100, substeps=20)
     for env in (elastic, own):
         env.reset(seed=0)
         env.step(torch.ones(1, *env.action_shape, dtype=env.dtype))
-    assert elastic.num_particles == 100
     assert (elastic.state.x - own.state.x).abs().max() > 1e-6
-
-
-def test_constants_that_no_body_takes_are_refused() -> None:
-    robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0))
-    env = tiny(dataclasses.replace(hop(), robot=robot))
-    with pytest.raises(ValueError, match="physics may not hold 'mu' in hop, whose bodies have their own materials"):
-        env.reset(seed=0, options={"physics": {"mu": 900.0}})
-    env.reset(seed=0, options={"physics": {"mass": 2.0, "gravity": (0.0, -1.0)}})
-
-
-def test_constants_that_only_the_object_takes_are_warned_of() -> None:
-    robot = dataclasses.replace(dittogym.make_spec("kick").robot, material=Elastic(1500.0, 50.0))
-    env = tiny("kick", body=robot)
-    with pytest.warns(UserWarning, match=r"physics\['lam'\] changes the object of kick alone, not the robot") as caught:
-        env.reset(seed=0, options={"physics": {"lam": 60.0}})
-    assert len(caught) == 1 and caught[0].filename == __file__
-    env.reset(seed=0, options={"physics": {"mass": 2.0}})
-
-
-@pytest.mark.parametrize(
-    ("part", "given", "kind"),
-    [
-        ("terms", torch.zeros(1), "torch.float32"),
-        ("terms", None, "None"),
-        ("memory", torch.zeros(1), "torch.float32"),
-        ("info", [1], "list"),
-        ("info", [], "list"),
-    ],
-)
-def test_what_comes_without_names_is_refused(part: str, given: object, kind: str) -> None:
-    env = tiny(
-        dataclasses.replace(hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(**{part: given}))
-    )
-    env.reset(seed=0)
-    with pytest.raises(TypeError, match=f"reward_fn of task 'hop' must return {part} by name, got {kind}"):
-        env.step(torch.zeros(1, *env.action_shape))
-
-
-def test_centres_of_windows_may_be_lists() -> None:
-    assert dataclasses.replace(hop(), view=[None, 0.28]).view == (None, 0.28)
+    with pytest.raises(ValueError, match="physics may not hold 'mu'"):
+        elastic.reset(seed=0, options={"physics": {"mu": 900.0}})
+    elastic.reset(seed=0, options={"physics": {"mass": 2.0, "gravity": (0.0, -1.0)}})
+    kick = tiny("kick", body=dataclasses.replace(dittogym.make_spec("kick").robot, material=Elastic(1500.0, 50.0)))
+    with pytest.warns(UserWarning, match=r"physics\['lam'\] changes the object of kick alone") as caught:
+        kick.reset(seed=0, options={"physics": {"lam": 60.0}})
+    assert [each.filename for each in caught] == [__file__]
 
 
 @pytest.mark.parametrize(
@@ -596,20 +374,16 @@ def test_centres_of_windows_may_be_lists() -> None:
         ("run", {"body": np.array([(0, 0), (4, 0), (4, 1), (0, 1)]), "device": torch.device("cpu")}),
         ("run", {"obstacles": (solid("box", i=(60, 66), j=(None, 24), friction=math.inf), floor(), ceiling(119))}),
         ("shapematch", {"target": dittogym.make_spec("shapematch", target="T").target}),
-        ("run", {"body": Disc((0.1, 0.16), 0.15)}),
-        ("run", {"body": Lattice((0.1, 0.16), (0.15, 0.15))}),
         ("run", {"body": Figure(np.tri(6, dtype=bool), (0.1, 0.16), 0.03)}),
         ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14)), np.int16(900), 3.0, Elastic(300.0, 50.0))}),
-        ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14), draws=2), 900), "segment": np.int64(5)}),
         ("dig", {"body": BodySpec(Disc((-0.2, 0.5), 0.14), 900, material=Snow(300.0, 50.0, hardening_range=(1, 2)))}),
     ],
 )
 def test_an_environment_is_made_again_from_the_json_of_its_specification(task: str, options: dict) -> None:
     env = gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL, **options)
     same = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    models = [each.unwrapped.torch_env.model for each in (env, same)]
-    assert models[0].constants == models[1].constants
     assert np.array_equal(env.reset(seed=0)[0], same.reset(seed=0)[0])
+    same.unwrapped.load(env.unwrapped.save())  # fits
     gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
 
 
@@ -621,54 +395,16 @@ def test_what_json_cannot_write_of_a_body_is_refused() -> None:
         tilt: float = 0.0
 
     learned = BodySpec(Disc((0.1, 0.16), 0.15), 900, material=Elastic(torch.tensor(300.0), 50.0))
-    with pytest.raises(TypeError, match="Tensor is not JSON serializable"):
+    with pytest.raises(TypeError, match="Tensor"):
         gymnasium.make("dittogym/run-coarse-v0", body=learned, **SMALL).spec.to_json()
     spec = gymnasium.make("dittogym/run-coarse-v0", body=Own((0.1, 0.16), 0.15), **SMALL).spec
-    with pytest.raises(ValueError, match=r"kind of a body or an obstacle must be one of BodySpec.* got {'corner'"):
+    with pytest.raises(ValueError, match="kind of a body"):
         gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(spec.to_json()))
 
 
-def test_a_function_with_any_options_takes_them() -> None:
-    def stretched(horizon: int = 30, **others: float):
-        return dataclasses.replace(hop(), name="stretched", horizon=horizon, **others)
-
-    dittogym.register("stretched", stretched)
-    spec = dittogym.make_spec("stretched", horizon=40, mu=900.0)
-    assert (spec.horizon, spec.mu) == (40, 900.0)
-    with pytest.raises(TypeError, match="others"):  # of dataclasses.replace
-        dittogym.make_spec("stretched", others=1.0)
-
-
-def test_its_title_is_its_name() -> None:
-    dittogym.register("hop", hop)
-    assert headline("hop") == headline("module:hop") == ("hop", "")
-    assert headline("shapematch") == ("SHAPE MATCH", "Take the shape of a picture, without gravity.")
-
-
-def nudged(part: str) -> Callable[[Moment, TaskSpec], Outcome]:
-    """A reward function that changes a part of its moment in place."""
-
-    def reward(moment: Moment, spec: TaskSpec) -> Outcome:
-        changed = {"particles": moment.robot_x, "start": moment.start.com, "memory": moment.memory["count"]}[part]
-        changed += 1.0
-        return height(moment, spec)
-
-    return reward
-
-
-@pytest.mark.parametrize("part", ["particles", "start", "memory"])
-def test_a_reward_function_that_changes_its_moment_is_refused(part: str) -> None:
-    spec = dataclasses.replace(
-        hop(), reward_fn=nudged(part), initial_memory=lambda moment, spec: {"count": moment.start.com[:, 1]}
-    )
+def test_centres_may_be_lists_and_a_fixed_window_may_lie_anywhere() -> None:
+    spec = changed(view=[None, 0.28], window=Window(left=0.1))
+    assert spec.view == (None, 0.28)
     env = tiny(spec)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=f"reward_fn of task 'hop' must not change .* in place.* {part}$"):
-        env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))
-
-
-def test_the_initial_memory_is_a_copy() -> None:
-    env = tiny(dataclasses.replace(hop(), initial_memory=lambda moment, spec: {"start": moment.start.com}))
-    env.reset(seed=0)
-    env.env_state.memory["start"].zero_()
-    assert env.env_state.start.com.any()
+    assert env.env_state.origin.tolist() == [[0.1, 0.0]]

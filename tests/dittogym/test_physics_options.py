@@ -3,17 +3,15 @@
 import math
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, set_particles, stir, tiny
+from tiny import actions, assert_same_bits, everything, set_particles, stir, tiny
 
 import dittogym
 import torchmpm
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
-from dittogym.render.colours import CONTRACT
 
 DT = 1e-4
 OWN = {name: getattr(dittogym.make_spec("kick"), name) for name in NAMES if name != "mass"} | {"mass": 1.0}
@@ -47,10 +45,9 @@ def strain(env: TorchEnv, count: int | None = None) -> torch.Tensor:
 # In which forms values may come.
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("form", [float, np.float64, np.array, torch.tensor])
-def test_one_number_for_all(form, dtype: str) -> None:
-    env = given(tiny("kick", 3, dtype=dtype), **{name: form(OWN[name]) for name in OWN if name != "gravity"})
+def test_one_number_for_all(form) -> None:
+    env = given(tiny("kick", 3, dtype="float32"), **{name: form(OWN[name]) for name in OWN if name != "gravity"})
     for name, values in env.env_state.physics.items():
         assert values.shape == (3,) and values.dtype == env.dtype
         assert values.tolist() == pytest.approx([OWN[name]] * 3)
@@ -71,32 +68,6 @@ def test_numbers_and_lists_are_as_exact_as_arrays() -> None:
         assert env.env_state.physics["lam"].tolist() == [49.9, 50.0] and env.state.x[1].tolist() == places
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (True, "must be real numbers, got True"),
-        (np.array([True, False]), "must be real numbers, got array"),
-        (torch.tensor(True), r"must be real numbers, got torch.bool"),
-        (1j, "must be real numbers, got 1j"),
-        ("stiff", "must be real numbers, got 'stiff'"),
-        (None, "must be real numbers, got None"),
-        ([[1.0], [1.0, 2.0]], r"must be numbers, got \[\[1.0\], \[1.0, 2.0\]\]"),
-        ([torch.tensor(1.0, requires_grad=True)] * 2, "must be numbers, got "),
-    ],
-)
-def test_what_is_no_number(value: object, message: str) -> None:
-    env = tiny("kick", 2)
-    with pytest.raises(ValueError, match=r"physics\['mu'\] " + message):
-        given(env, mu=value)
-
-
-def test_gravity_for_all_and_for_each() -> None:
-    each = [[0.0, -1.0], [2.0, 0.0], [0.0, 0.0]]
-    for value in ((1.0, -2.0), np.array([1.0, -2.0]), torch.tensor([1.0, -2.0]), each):
-        found = given(tiny("kick", 3), gravity=value).env_state.physics["gravity"]
-        assert found.tolist() == torch.as_tensor(value).expand(3, 2).tolist()
-
-
 @torch.no_grad()
 def test_the_tasks_own_values_change_nothing() -> None:
     for task in dittogym.TASKS:
@@ -113,18 +84,6 @@ def test_the_tasks_own_values_change_nothing() -> None:
             assert torch.allclose(a, b, rtol=1e-9, atol=1e-9), task
 
 
-def test_through_gymnasium() -> None:
-    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
-    env.reset(seed=0, options={"physics": {"gravity": (0.0, 0.0), "mu": 100}})
-    assert env.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0]
-    vector = make_vec(max_episode_steps=2)
-    vector.reset(seed=0, options={"physics": {"mu": np.array([100.0, 200.0])}})
-    for _ in range(4):  # through an autoreset
-        vector.step(np.zeros(vector.action_space.shape, np.float32))
-    assert vector.unwrapped.torch_env.env_state.steps.tolist() == [1, 1]
-    assert vector.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0, 200.0]
-
-
 # What each of them does.
 
 
@@ -133,9 +92,9 @@ def test_gravity_has_a_limit_that_depends_on_the_substeps(dt: float, largest: fl
     """Beyond it a particle at rest crosses a cell within a substep."""
     env = tiny("run", 1, dt=dt, substeps=1)
     given(env, gravity=(0.0, -0.99 * largest))
-    with pytest.raises(ValueError, match=rf"^physics\['gravity'\], with substeps of {dt} s, must be above -{largest}"):
+    with pytest.raises(ValueError, match=rf"^physics\['gravity'\].* must be above -{largest}"):
         given(env, gravity=(0.0, -1.01 * largest))
-    with pytest.raises(ValueError, match=f"^gravity, with substeps of {dt} s, must be below {largest}"):
+    with pytest.raises(ValueError, match=rf"^gravity.* must be below {largest}"):
         spec = replace(dittogym.make_spec("run"), gravity=(2 * largest, 0.0))
         TorchEnv(spec, 1, dt=dt, substeps=1)
 
@@ -204,14 +163,6 @@ def test_stiffness_of_robot_and_object(name: str, shape: tuple[float, float]) ->
 
 
 @torch.no_grad()
-def test_soil_keeps_its_own_stiffness() -> None:
-    env = given(tiny("dig", 2, substeps=1), mu=[100.0, 2000.0], gravity=(0.0, 0.0))
-    solver = env.model.solver_for(env.env_state.physics)
-    assert solver.bodies[1].material is env.spec.objects[0].material
-    assert solver.bodies[0].material.mu.tolist() == [100.0, 2000.0]
-
-
-@torch.no_grad()
 def test_yield_stress_limits_the_strain() -> None:
     """The difference of logarithmic principal strains does not exceed sqrt(2) times yield stress over 2 mu."""
     limits = torch.tensor([5.0, 20.0, 1e5], dtype=torch.float64)
@@ -226,14 +177,6 @@ def test_yield_stress_limits_the_strain() -> None:
     assert float(gap[2]) > 1.2 * float(bound[1])
 
 
-@torch.no_grad()
-def test_max_actuation_is_what_the_picture_is_coloured_by() -> None:
-    env = alike(tiny("shapematch", 2), max_actuation=[10.0, 80.0])
-    env.step(torch.ones(2, *env.action_shape, dtype=env.dtype))
-    red = [(np.abs(env.render(i, muscles=True) - CONTRACT).max(-1) < 12).sum() for i in (0, 1)]
-    assert red[0] > 1000 and red[0] == pytest.approx(red[1], rel=0.05)
-
-
 # How long they hold.
 
 
@@ -246,19 +189,7 @@ def test_values_stay_until_given_again() -> None:
     physics = env.env_state.physics
     assert physics["gravity"].tolist() == [[0.0, -1.0]] * 2
     assert "mu" not in physics  # what is not given is the task's own
-
-
-@torch.no_grad()
-def test_an_empty_mapping_goes_back_to_the_task() -> None:
-    env, plain = given(tiny("run", 2, substeps=20), mu=50.0, mass=3.0, gravity=(9.0, 0.0)), tiny("run", 2, substeps=20)
     env.reset(options={"physics": {}})
-    plain.reset(seed=0)
-    for action in actions(env, 2):
-        ours, theirs = env.step(action), plain.step(action)
-    assert torch.equal(ours[0], theirs[0])
-    assert torch.allclose(ours[1], theirs[1], rtol=1e-10)
-    assert torch.allclose(env.state.x, plain.state.x, rtol=0, atol=1e-12)
-    env.reset()
     assert not env.env_state.physics
 
 
@@ -324,35 +255,31 @@ def test_gradients_of_a_reward_in_every_constant() -> None:
             assert ours.tolist() == pytest.approx(difference.tolist(), rel=1e-4), name
 
 
-def test_gradients_stay_with_the_masked_elements() -> None:
-    """A value given to one element only has a gradient there, and the others keep theirs."""
-    env = tiny("kick", 2, substeps=10)
-    first, second = (torch.full((2,), 500.0, dtype=env.dtype, requires_grad=True) for _ in range(2))
-    env.reset(seed=0, options={"physics": {"mu": first}})
-    env.reset(options={"physics": {"mu": second}, "reset_mask": [False, True]})
-    for action in actions(env, 2):
-        reward = env.step(action)[1]
-    reward.sum().backward()
-    assert first.grad[0] != 0 and first.grad[1] == 0 and second.grad[0] == 0 and second.grad[1] != 0
-
-
 # What is refused.
 
 
 @pytest.mark.parametrize(
     ("physics", "message"),
     [
-        (3.0, "physics must be a mapping from mu, lam, .* gravity, mass to values, got float"),
-        ({"nu": 0.3}, "physics may hold mu, lam, yield_stress, max_actuation, gravity, mass, got 'nu'"),
-        ({"mu": [1.0, 2.0, 3.0]}, r"physics\['mu'\] must have shape \(\) or \(2,\) or \(2, 120\), got \(3,\)"),
-        ({"max_actuation": torch.ones(2, 120)}, r"\['max_actuation'\] must have shape \(\) or \(2,\), got \(2, 120\)"),
-        ({"gravity": -9.0}, r"physics\['gravity'\] must have shape \(2,\) or \(2, 2\), got \(\)"),
-        ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
-        ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),
-        ({"mu": float("nan")}, r"physics\['mu'\] must be finite, positive, got nan"),
-        ({"lam": [50.0, -5000.0]}, r"physics\['lam'\] must be at least -mu, -650, got -5000"),
-        ({"lam": -70.0, "mu": torch.tensor([[60.0, 80.0]]).repeat(2, 60)}, r"must be at least -mu, -60, got -70"),
-        ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\] must be finite, got nan"),
+        (3.0, "physics must"),
+        ({"nu": 0.3}, "got 'nu'"),
+        *(
+            ({"mu": value}, r"physics\['mu'\]")
+            for value in (True, torch.tensor(True), 1j, "stiff", None, [[1.0], [1.0, 2.0]])
+        ),
+        ({"mu": [1.0, 2.0, 3.0]}, r"physics\['mu'\]"),
+        ({"mu": [1.0, -2.0]}, r"physics\['mu'\]"),
+        ({"mu": float("nan")}, r"physics\['mu'\]"),
+        ({"max_actuation": torch.ones(2, 120)}, r"physics\['max_actuation'\]"),
+        ({"yield_stress": -1.0}, r"physics\['yield_stress'\]"),
+        ({"lam": [50.0, -5000.0]}, r"physics\['lam'\] must be at least -mu, -650"),
+        (
+            {"lam": -70.0, "mu": torch.tensor([[60.0, 80.0]]).repeat(2, 60)},
+            r"physics\['lam'\] must be at least -mu, -60",
+        ),
+        ({"gravity": -9.0}, r"physics\['gravity'\]"),
+        ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\]"),
+        *(({"mass": mass}, r"physics\['mass'\]") for mass in (0.0, 1e30)),
     ],
 )
 def test_bad_physics(physics: object, message: str) -> None:
@@ -366,14 +293,6 @@ def test_bad_physics(physics: object, message: str) -> None:
     assert_same_bits(everything(env), numbers)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_substeps_of_the_tasks_are_stable(task: str) -> None:
-    """With full muscles, by a third in DIG and by more than twice elsewhere."""
-    env = tiny(task)
-    limit = env.model.solver.stable_dt(env.spec.max_actuation)
-    assert limit > (1.3 if task == "dig" else 2.5) * DT
-
-
 def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     """By the task's numbers, muscles included; the batch goes on as it was."""
     env = tiny("run", 2)
@@ -381,8 +300,7 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     before = env.state
     limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
     for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):
-        message = r"dt must be at most (\S+) s .* the material, muscles and mass of the robot, got 0\.0001"
-        with pytest.raises(ValueError, match=message) as raised:
+        with pytest.raises(ValueError, match=r"dt must be at most \S+ s .* of the robot") as raised:
             env.reset(options={"physics": physics})
         if "mu" in physics and "mass" not in physics:
             assert float(str(raised.value).split()[5]) == pytest.approx(limit, rel=1e-6)
@@ -392,18 +310,8 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
         tiny(replace(dittogym.make_spec("run"), mu=9000.0))
     kick = dittogym.make_spec("kick")
     hard = replace(kick.objects[0], material=torchmpm.Elastic(2e4, 100.0))
-    with pytest.raises(ValueError, match="mass of the object, got"):
+    with pytest.raises(ValueError, match="of the object"):
         tiny(replace(kick, objects=(hard,)))
-
-
-def test_a_negative_lame_parameter_is_that_of_the_task() -> None:
-    """A negative Poisson's ratio, as a task may have it too."""
-    env, auxetic = tiny("run"), tiny(replace(dittogym.make_spec("run"), lam=-60.0))
-    env.reset(seed=0, options={"physics": {"lam": -60.0}})
-    auxetic.reset(seed=0)
-    action = actions(env, 1)[0]
-    env.step(action), auxetic.step(action)
-    torch.testing.assert_close(env.state.x, auxetic.state.x, rtol=0, atol=1e-12)
 
 
 def test_zero_is_allowed_where_it_makes_sense() -> None:

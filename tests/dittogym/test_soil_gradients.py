@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dittogym import TorchEnv, core, make_spec
 from dittogym.action import bicubic
-from dittogym.model import EnvState
+from dittogym.core import EnvState
 from torchmpm.backends import compiler_found
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler: thousands of substeps take too long")

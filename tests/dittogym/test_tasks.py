@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import dittogym
-from dittogym.observation import raster as obs
+from dittogym import observation as obs
 from torchmpm import Grid
 from torchmpm.boundary import constrain, faces
 from torchmpm.grid import PAD

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 import dittogym
 from dittogym import TorchEnv
 from dittogym.core import FAILURE_REWARD
-from dittogym.observation.camera import per_particle
+from dittogym.observation import per_particle
 
 
 def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
@@ -49,28 +49,19 @@ def test_a_seed_for_each_element() -> None:
     env.reset(seed=[7, 5, 6])
     env.reset(seed=(0, 0, 7), options={"reset_mask": torch.tensor([False, False, True])})
     assert torch.equal(env.state.x, counted.state.x[[2, 0, 2]])
-    for wrong, message in (
-        ([1, 2], "seed must be a whole number or 3 of them"),
-        ([1, -2, 3], r"seed\[1\] must not be"),
-        (np.array([1, 2]), "seed must be a whole number or 3 of them"),
-        (np.array([1.0, 2.0, 3.0]), r"seed\[0\] must be a whole number, got 1.0"),
-        (np.array(3), r"seed must be a whole number, got array\(3\)"),
-    ):
-        with pytest.raises(ValueError, match=message):
+    for wrong in ([1, 2], [1, -2, 3], np.array([1, 2]), np.array([1.0, 2.0, 3.0]), np.array(3)):
+        with pytest.raises(ValueError, match="seed"):
             env.reset(seed=wrong)
 
 
-def test_reset_is_fresh_and_reference_parity_is_stale() -> None:
-    for parity in ("clean", "reference"):
-        env = small(parity=parity, action_layout="grid")
-        first, _ = env.reset(seed=0)
-        for action in actions(env, 4):
-            last = env.step(action)[0]
-        centre = env.env_state.centre
-        again, _ = env.reset()
-        assert not torch.equal(first, last)
-        assert torch.equal(again, first if parity == "clean" else last)
-        assert torch.equal(env.env_state.centre, env.env_state.start.com if parity == "clean" else centre)
+def test_a_reset_shows_the_new_episode() -> None:
+    env = small()
+    first, _ = env.reset(seed=0)
+    for action in actions(env, 4):
+        last = env.step(action)[0]
+    again, _ = env.reset()
+    assert torch.equal(again, first) and not torch.equal(again, last)
+    assert torch.equal(env.env_state.centre, env.env_state.start.com)
 
 
 def test_positions_option() -> None:
@@ -84,19 +75,19 @@ def test_positions_option() -> None:
 
 
 @pytest.mark.parametrize(
-    ("positions", "message"),
+    "positions",
     [
-        (np.zeros((299, 2)), r"positions must have shape \(300, 2\)"),
-        (np.full((300, 2), np.nan), "positions must be finite, got nan"),
-        (np.linspace((0.0, 0.5), (2.0, 0.5), 300), "inside the window"),
-        (np.linspace((0.4, -0.5), (0.5, 0.5), 300), "inside the window"),
+        np.zeros((299, 2)),
+        np.full((300, 2), np.nan),
+        np.linspace((0.0, 0.5), (2.0, 0.5), 300),  # outside the window
+        np.linspace((0.4, -0.5), (0.5, 0.5), 300),
     ],
 )
-def test_bad_positions(positions: np.ndarray, message: str) -> None:
+def test_bad_positions(positions: np.ndarray) -> None:
     env = small()
     env.reset(seed=0)
     before = env.state
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="positions must"):
         env.reset(options={"positions": positions})
     assert env.state is before
 
@@ -145,19 +136,20 @@ def float64() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("action", "message"),
+    "action",
     [
-        (torch.zeros(1, 2, 8, 7), r"shape \(1, 2, 8, 8\), got \(1, 2, 8, 7\)"),
-        (torch.full((1, 2, 8, 8), torch.nan), "finite, got 128 entries"),
-        (torch.zeros(1, 2, 8, 8, dtype=torch.int64), "floating point"),
-        (np.zeros((1, 2, 8, 8)), "floating point tensor, got ndarray"),
+        torch.zeros(1, 2, 8, 7),
+        torch.full((1, 2, 8, 8), torch.nan),
+        torch.zeros(1, 2, 8, 8, dtype=torch.int64),
+        torch.zeros(1, 2, 8, 8).to_sparse(),
+        np.zeros((1, 2, 8, 8)),
     ],
 )
-def test_bad_actions(action: object, message: str) -> None:
+def test_bad_actions(action: object) -> None:
     env = small()
     env.reset(seed=0)
     before = env.state
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="action must"):
         env.step(action)
     assert env.state is before
 
@@ -168,12 +160,10 @@ def test_bad_resets() -> None:
         env.step(torch.zeros(2, 2, 8, 8))
     with pytest.raises(ValueError, match="first time"):
         env.reset(options={"reset_mask": [True, False]})
-    with pytest.raises(ValueError, match="reset_mask must be bool"):
+    with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": [1, 0]})
-    with pytest.raises(ValueError, match="options may hold physics, positions, reset_mask, got 'position'"):
+    with pytest.raises(ValueError, match=r"options may hold .* got 'position'"):
         env.reset(options={"position": 0})
-    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
-        env.reset(seed=-1)
 
 
 @pytest.mark.parametrize("backend", ["auto", "eager"])
@@ -207,18 +197,11 @@ def test_detach_cuts_the_graph() -> None:
     env.detach()
     env.step(second)[1].sum().backward()
     assert first.grad is None and second.grad is not None
-
-
-def test_a_constant_is_learned_from_one_stretch_after_the_other() -> None:
-    env, mu = small(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
-    drive = torch.full((1, 2, 8, 8), 0.5, dtype=torch.float64)
+    mu = torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
     env.reset(seed=0, options={"physics": {"mu": mu}})
-    for _ in range(3):
-        (slope,) = torch.autograd.grad(env.step(drive)[1].sum(), mu)
-        assert slope != 0
-        env.detach(physics=False)
-    env.detach()
-    assert not env.step(drive)[1].requires_grad
+    for _ in range(2):
+        assert torch.autograd.grad(env.step(first)[1].sum(), mu)[0] != 0
+        env.detach(physics=False)  # but for a constant that is learned from one stretch after the other
 
 
 @pytest.mark.parametrize("use_reentrant", [True, False])
@@ -276,6 +259,19 @@ def test_image_layout_acts_where_it_looks() -> None:
     assert moved["grid"][0] < -0.01 and moved["grid"][1] < -0.01
 
 
+def test_random_generators_can_be_put_back() -> None:
+    env = tiny("run", 2, resample=True)
+    env.reset(seed=0)
+    before = env.generators
+    env.reset()
+    places = env.state.x
+    env.generators = before
+    env.reset()
+    assert torch.equal(env.state.x, places)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first: elements \[0, 1\] have no random generator yet"):
+        tiny("run", 2, resample=True).generators = before
+
+
 @torch.no_grad()
 def test_run_displacement_is_the_same_at_every_tier() -> None:
     """A gentle drive over ten steps: centre of mass and reward of the lite tier against full size."""
@@ -291,28 +287,3 @@ def test_run_displacement_is_the_same_at_every_tier() -> None:
     assert (results["full"][0] - results["lite"][0]).abs().max() < 1e-3
     assert results["full"][1] == pytest.approx(results["lite"][1], abs=0.15)
     assert results["full"][2] == pytest.approx(results["lite"][2], abs=1e-3)
-
-
-@pytest.mark.parametrize("parity", ["clean", "reference"])
-def test_the_hand_of_catch_is_chosen_by_a_stale_position_with_parity(parity: str) -> None:
-    env = tiny("catch", parity=parity)
-    env.reset(seed=0)
-    with torch.no_grad():
-        env.state.x[:, env.model.num_robot_particles :] += 0.01
-        env.step(torch.zeros(1, *env.action_shape))
-    moved = env.env_state.memory["object_com"]
-    env.reset()
-    assert torch.equal(env.env_state.memory["object_com"], moved) == (parity == "reference")
-
-
-def test_random_generators_can_be_put_back() -> None:
-    env = tiny("run", 2, resample=True)
-    env.reset(seed=0)
-    before = env.generators
-    env.reset()
-    places = env.state.x
-    env.generators = before
-    env.reset()
-    assert torch.equal(env.state.x, places)
-    with pytest.raises(RuntimeError, match=r"call reset\(\) first: elements \[0, 1\] have no random generator yet"):
-        tiny("run", 2, resample=True).generators = before

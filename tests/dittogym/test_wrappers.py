@@ -57,18 +57,11 @@ def test_actions_are_enlarged_by_bicubic_interpolation(size: int) -> None:
         large = bicubic(actions, 8)
         assert wrapped.action(actions[0]) == pytest.approx(large[0], abs=1e-5)
         assert vector.actions(actions) == pytest.approx(large, abs=1e-5)
+        assert bare.action_space.contains(wrapped.action(np.sign(actions[0])))  # although interpolation overshoots
         ours, theirs = wrapped.step(actions[0]), bare.step(large[0])
         assert np.abs(ours[0].astype(int) - theirs[0]).max() <= 1 and ours[1] == pytest.approx(theirs[1], abs=1e-4)
         ours, theirs = vector.step(actions), bare_vector.step(large)
         assert np.abs(ours[0].astype(int) - theirs[0]).max() <= 1 and ours[1] == pytest.approx(theirs[1], abs=1e-4)
-
-
-def test_enlarged_actions_do_not_leave_the_space() -> None:
-    """Bicubic interpolation overshoots at edges."""
-    env = action_resolution(single(), 4)
-    edge = np.where(np.indices((2, 4, 4))[2] < 2, -1.0, 1.0).astype(np.float32)
-    assert np.abs(cv2.resize(edge[0], (8, 8), interpolation=cv2.INTER_CUBIC)).max() > 1.0
-    assert single().action_space.contains(env.action(edge))
 
 
 @pytest.mark.parametrize("size", [1, 8, 16, 32])
@@ -82,13 +75,6 @@ def test_observations_are_area_means(size: int) -> None:
             blocks = whole[0].reshape(*whole[0].shape[:-2], size, width, size, width).astype(float)
             assert np.abs(ours[0] - blocks.mean((-3, -1))).max() <= 0.5
         assert ours[0].std() > 0
-
-
-@pytest.mark.parametrize("make", [single, batch])
-@pytest.mark.parametrize("size", [0, -1, 65])
-def test_bad_observation_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be at (least 1|most 64), got {size}"):
-        observation_resolution(make(), size)
 
 
 # Gymnasium's wrappers.
@@ -188,13 +174,13 @@ def test_observations_of_environments_that_reset_in_the_same_step() -> None:
         assert np.array_equal(cv2.resize(large[0], (16, 16), interpolation=cv2.INTER_AREA), little[0])
 
 
-def test_actions_of_another_size_are_refused() -> None:
+def test_what_does_not_fit_is_refused() -> None:
     env = action_resolution(single(), 4)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"action must end in the shape \(4, 4\), got \(2, 5, 5\)"):
+    with pytest.raises(ValueError, match="action"):
         env.step(np.zeros((2, 5, 5), np.float32))
-
-
-def test_a_torch_env_is_no_gymnasium_environment() -> None:
-    with pytest.raises(TypeError, match=r"env must be a Gymnasium environment .* got TorchEnv"):
+    with pytest.raises(TypeError, match="env"):
         action_resolution(dittogym.TorchEnv("run", **SMALL), 4)
+    for size in (0, -1, 65):
+        with pytest.raises(ValueError, match="size"):
+            observation_resolution(batch(), size)

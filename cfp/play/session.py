@@ -7,25 +7,24 @@ import inspect
 import io
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym.action import from_grid_indexing, patch_corner, to_grid_indexing, trained_indexing
-from dittogym.geometry import NODES
-from dittogym.model import Snapshot, check_stability
+from cfp.play import protocol
+from cfp.play.hand import Direction, Grip, press, reach, wave
+from dittogym.action import bicubic, from_grid_layout, patch_corner, to_grid_layout, trained_layout
+from dittogym.core import check_stability
+from dittogym.geometry import NODES, centre_in_window
 from dittogym.physics import check_effect, physics_values
-from dittogym.play import protocol
-from dittogym.play.episode import Episode, same_physics, stacked
-from dittogym.play.hand import Direction, Grip, press, reach, wave
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
+from dittogym.snapshots import Snapshot
 from dittogym.tasks import TASKS, headline, task_name
 from dittogym.torch_env import TorchEnv
-from dittogym.window import centre_in_window
 
 #: Names of the bits of a frame's flags.
 FLAGS = ("playing", "terminated", "truncated", "success", "invalid")
@@ -40,6 +39,33 @@ CHANNELS = {"both": slice(0, 2), "horizontal": slice(0, 1), "vertical": slice(1,
 #: the ``resolution`` of its actions.
 LoadPolicy = Callable[[], Any]
 Answers = list[dict[str, Any]]
+
+
+@dataclass
+class History:
+    """What has happened since the last reset."""
+
+    seed: int  # Of the particles
+    recording: Recording
+    touched: list[str]  # Changes that replaying the actions does not reproduce
+    actions: list[np.ndarray] = field(default_factory=list)
+    total: float = 0.0  # Return
+    terminated: bool = False
+    truncated: bool = False
+    success: bool = False
+    invalid: bool = False
+    memory: Any = None  # Of the policy
+
+    def copy(self) -> History:
+        """The same, with lists that do not grow with those of an episode that goes on."""
+        shots, rewards = self.recording.shots.copy(), self.recording.rewards.copy()
+        recording = replace(self.recording, shots=shots, rewards=rewards)
+        return replace(self, recording=recording, touched=self.touched.copy(), actions=self.actions.copy())
+
+    def note(self, change: str) -> None:
+        """Remember a change that replaying the actions does not reproduce."""
+        if change not in self.touched:
+            self.touched.append(change)
 
 
 class Session:
@@ -57,11 +83,14 @@ class Session:
         TypeError: The task has no such option.
     """
 
-    episode: Episode
+    history: History
     shot: Shot
     grip: Grip | None
-    direction: Direction | None = None
     terms: Mapping[str, Tensor]
+    direction: Direction | None = None
+    policy: Any = None
+    policy_name: str | None = None
+    saved: tuple[Snapshot, History] | None = None
 
     def __init__(
         self,
@@ -77,14 +106,11 @@ class Session:
         self.control_step = self.env.model.substeps * self.env.model.solver.dt
         self.playing, self.speed = True, 0.1 if self.env.spec.horizon * self.control_step < SHORT else 1.0
         self.colour = "deformation" if policy is None else "muscle"
-        self.policy: Any = None
-        self.policy_name: str | None = None
         self.hand = protocol.Hand(None)
         self.physics: dict[str, Any] = {}
-        self.saved: tuple[Snapshot, Episode] | None = None
         self.num_frames = self.num_steps = 0
         self._reset(seed)
-        self._apply_policy(protocol.Policy(policy))
+        self._choose_policy(policy)
 
     def describe(self) -> dict[str, Any]:
         """What the page needs to know about the task, as JSON values."""
@@ -115,7 +141,37 @@ class Session:
         Raises:
             ValueError: It cannot be done, and nothing has changed.
         """
-        return getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
+        match message:
+            case protocol.Play():
+                self.playing = message.playing and not self.history.invalid
+            case protocol.Speed():
+                self.speed = message.factor
+            case protocol.Step():
+                self.playing = False
+                self.advance()
+            case protocol.Reset():
+                self._reset(self.seed if message.seed is None else message.seed)
+                return [{"type": "reset"}]
+            case protocol.Hand():
+                self.grip = self.grip if message.tool == self.hand.tool else None
+                self.hand = message
+            case protocol.Paint() | protocol.Clear():
+                self._paint(message)
+            case protocol.Wave():
+                self.direction = message.direction
+            case protocol.Policy():
+                return self._choose_policy(message.name)
+            case protocol.Colour():
+                self.colour = message.by
+            case protocol.Matter():
+                self._change_matter(message)
+            case protocol.Save():
+                return self._save(message.what)
+            case protocol.Back():
+                return self._go_back()
+            case protocol.Draw():
+                return self._draw(message)
+        return []
 
     def advance(self) -> None:
         """Take one control step, unless the state is no longer valid.
@@ -123,8 +179,8 @@ class Session:
         Raises:
             Exception: What a task or a policy of the user's does wrong; time is stopped.
         """
-        episode = self.episode
-        if episode.invalid:
+        history = self.history
+        if history.invalid:
             return
         playing, self.playing = self.playing, False  # until it has worked
         self.action = self._next_action()
@@ -132,41 +188,39 @@ class Session:
         with torch.no_grad():
             self.observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(self.action)[None])
         self.num_steps, self.terms = self.num_steps + 1, info["reward_terms"]
-        earned = 0.0 if episode.terminated or episode.truncated else float(reward[0])
-        episode.total += earned
-        self.rows.append([episode.total, *(float(term[0]) for term in self.terms.values())])
-        episode.terminated |= bool(terminated[0])
-        episode.truncated |= bool(truncated[0])
-        episode.success = "is_success" in info and bool(info["is_success"][0])
-        episode.invalid = not bool(info["finite"][0])
-        self.playing, self.shot = playing and not episode.invalid, self.env.shot()
-        if len(episode.actions) == LONGEST:
-            return episode.note(f"only the first {LONGEST} steps are kept")
-        episode.actions.append(self.action)
-        episode.recording.shots.append(self.shot)
-        episode.recording.rewards.append(earned)
-        episode.recording.success = episode.success if "is_success" in info else None
+        earned = 0.0 if history.terminated or history.truncated else float(reward[0])
+        history.total += earned
+        self.rows.append([history.total, *(float(term[0]) for term in self.terms.values())])
+        history.terminated |= bool(terminated[0])
+        history.truncated |= bool(truncated[0])
+        history.success = "is_success" in info and bool(info["is_success"][0])
+        history.invalid = not bool(info["finite"][0])
+        self.playing, self.shot = playing and not history.invalid, self.env.shot()
+        if len(history.actions) == LONGEST:
+            return history.note(f"only the first {LONGEST} steps are kept")
+        history.actions.append(self.action)
+        history.recording.shots.append(self.shot)
+        history.recording.rewards.append(earned)
+        history.recording.success = history.success if "is_success" in info else None
 
     def frame(self, rate: float) -> bytes:
-        """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
+        """The present moment for the page, at ``rate`` simulated seconds per second; see :data:`protocol.HEAD`."""
         self.num_frames, shot = self.num_frames + 1, self.shot
-        flags = sum(getattr(self if name == "playing" else self.episode, name) << bit for bit, name in enumerate(FLAGS))
+        flags = sum(getattr(self if name == "playing" else self.history, name) << bit for bit, name in enumerate(FLAGS))
+        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
+        self.rows.clear()
         codes = np.full(len(shot.x), 127, np.uint8)
         own = shot.values.get(self.colour, codes)
         codes[: len(own)] = own
-        images = (
-            self.observation[0].cpu().numpy(),
-            (127 * self.action).round().astype(np.int8),
-            (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8),
-        )
-        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
-        self.rows.clear()
-        numbers = (*shot.origin, *shot.centre, *self._corner(), self.episode.total, rate)
-        counters = self.num_frames, shot.step, self.hand.id, flags
-        return protocol.pack_frame(counters, numbers, rows, (protocol.quantise(shot.x, shot.origin), codes, *images))
+        observation, action = self.observation[0].cpu().numpy(), (127 * self.action).round().astype(np.int8)
+        gate = (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8)
+        counters = (self.num_frames, shot.step, self.hand.id, flags)
+        sizes = (*rows.shape, len(shot.x), action.shape[-1], gate.shape[-1])
+        head = protocol.HEAD.pack(*counters, *sizes, *shot.centre, *self._corner(), self.history.total, rate)
+        arrays = (rows, shot.x, codes, observation, action, gate)
+        return b"".join((head, *(array.tobytes() for array in arrays)))
 
-    def _reset(self, seed: int | None) -> None:
-        seed = self.seed if seed is None else seed  # also that of a moment that was gone back to
+    def _reset(self, seed: int) -> None:
         self.observation, self.seed = self.env.reset(seed=seed, options={"physics": self.physics})[0], seed
         self.grip, self.terms = None, {}
         self.rows: list[list[float]] = []
@@ -175,7 +229,7 @@ class Session:
         self.shot = self.env.shot()
         drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
         touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
-        self.episode = Episode(seed, Recording(describe(self.env.model), [self.shot]), touched)
+        self.history = History(seed, Recording(describe(self.env.model), [self.shot]), touched)
 
     def _next_action(self) -> np.ndarray:
         """What policy, paint, waves and hand add up to, float32 (2, R, R) in [-1, 1]."""
@@ -197,14 +251,14 @@ class Session:
             chosen, gate = policy.predict_with_gate(images, deterministic)
             self.gate = self.gate if gate is None else self._as_image(gate)[0]
         else:
-            episode, start = self.episode, np.array([not self.episode.actions])
-            chosen, episode.memory = policy.predict(images, episode.memory, start, deterministic)
+            history, start = self.history, np.array([not self.history.actions])
+            chosen, history.memory = policy.predict(images, history.memory, start, deterministic)
         return self._as_image(chosen)[0]
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
         """What a policy returns (B, 2, R, R), oriented as the page shows it."""
-        layout = trained_indexing(self.policy) or "image"
-        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), "image").numpy()
+        layout = trained_layout(self.policy) or "image"
+        return from_grid_layout(to_grid_layout(torch.as_tensor(array), layout), "image").numpy()
 
     def _pull(self) -> None:
         """Let the hand pull at matter, which it takes hold of the first time."""
@@ -215,51 +269,28 @@ class Session:
         self.grip = self.grip or Grip.take(state.particles, point)
         if self.grip is not None:
             self.env.env_state = replace(state, particles=self.grip.pull(state.particles, point))
-            self.episode.note("pulled by hand")
+            self.history.note("pulled by hand")
 
     def _corner(self) -> np.ndarray:
         """Lower left corner (2,) of the action image in the world, m."""
         state, spec = self.env.env_state, self.env.spec
-        corner = patch_corner(centre_in_window(spec.reach, state.centre, state.origin), spec.patch, NODES)
+        corner = patch_corner(centre_in_window(spec.patch_centre, state.centre, state.origin), spec.patch, NODES)
         return (state.origin[0] + corner[0] / NODES).cpu().double().numpy()
 
-    def _apply_play(self, message: protocol.Play) -> None:
-        self.playing = message.playing and not self.episode.invalid
+    def _paint(self, message: protocol.Paint | protocol.Clear) -> None:
+        painted = np.zeros_like(self.painted) if isinstance(message, protocol.Clear) else self.painted.copy()
+        if isinstance(message, protocol.Paint):
+            size, (rows, columns) = self.env.action_resolution, np.array(message.cells).T
+            if (largest := int(np.max(message.cells))) >= size:
+                raise ValueError(f"cells must be rows and columns below {size}, got {largest}")
+            painted[CHANNELS[message.muscles], rows, columns] = message.value
+        self.painted = painted
+        self.action = self.action if self.playing else painted
 
-    def _apply_speed(self, message: protocol.Speed) -> None:
-        self.speed = message.factor
-
-    def _apply_step(self, message: protocol.Step) -> None:
-        self.playing = False
-        self.advance()
-
-    def _apply_reset(self, message: protocol.Reset) -> Answers:
-        self._reset(message.seed)
-        return [{"type": "reset"}]
-
-    def _apply_hand(self, message: protocol.Hand) -> None:
-        self.grip = self.grip if message.tool == self.hand.tool else None
-        self.hand = message
-
-    def _apply_paint(self, message: protocol.Paint) -> None:
-        size, (rows, columns) = self.env.action_resolution, np.array(message.cells).T
-        if (largest := int(np.max(message.cells))) >= size:
-            raise ValueError(f"cells must be rows and columns below {size}, got {largest}")
-        self.painted = self.painted.copy()
-        self.painted[CHANNELS[message.muscles], rows, columns] = message.value
-        self.action = self.action if self.playing else self.painted
-
-    def _apply_clear(self, message: protocol.Clear) -> None:
-        self.painted = np.zeros_like(self.painted)
-        self.action = self.action if self.playing else self.painted
-
-    def _apply_wave(self, message: protocol.Wave) -> None:
-        self.direction = message.direction
-
-    def _apply_policy(self, message: protocol.Policy) -> Answers:
-        if message.name is not None and message.name not in self.policies:
-            raise ValueError(f"name must be one of {', '.join(self.policies) or 'none'}, got {message.name!r}")
-        policy: Any = None if message.name is None else self.policies[message.name]()
+    def _choose_policy(self, name: str | None) -> Answers:
+        if name is not None and name not in self.policies:
+            raise ValueError(f"name must be one of {', '.join(self.policies) or 'none'}, got {name!r}")
+        policy: Any = None if name is None else self.policies[name]()
         env, resolution = self.env, self.own_resolution if policy is None else policy.resolution
         if resolution != env.action_resolution:
             env = TorchEnv(self.task, 1, **{**self.options, "resolution": resolution})
@@ -269,15 +300,12 @@ class Session:
         if env is not self.env:
             self.env = env
             self.action = self.painted = np.zeros(env.action_shape, np.float32)
-        self.policy_name, self.gate = message.name, np.zeros((2, 0, 0), np.float32)
-        for episode in (self.episode, *(self.saved or ())[1:]):
-            episode.memory = None  # it belongs to the policy before
-        return [{"type": "policy", "name": message.name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
+        self.policy_name, self.gate = name, np.zeros((2, 0, 0), np.float32)
+        for history in (self.history, *(self.saved or ())[1:]):
+            history.memory = None  # it belongs to the policy before
+        return [{"type": "policy", "name": name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
-    def _apply_colour(self, message: protocol.Colour) -> None:
-        self.colour = message.by
-
-    def _apply_matter(self, message: protocol.Matter) -> None:
+    def _change_matter(self, message: protocol.Matter) -> None:
         spec, state = self.env.spec, self.env.env_state
         physics: dict[str, Any] = {}
         if message.stiffness != 1:
@@ -290,39 +318,41 @@ class Session:
         check_effect(spec, values)
         check_stability(self.env.model, values)
         if physics != self.physics:
-            self.episode.note(CHANGED_MATTER)
+            self.history.note(CHANGED_MATTER)
         self.physics, self.env.env_state = physics, replace(state, physics=values)
 
-    def _apply_save(self, message: protocol.Save) -> Answers:
-        file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
-        if message.what == "moment":
-            name, self.saved = f"{name}.pt", (self.env.save(), self.episode.copy())
+    def _save(self, what: str) -> Answers:
+        file, name, history = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}", self.history
+        if what == "moment":
+            name, self.saved = f"{name}.pt", (self.env.save(), history.copy())
             torch.save(self.saved[0], file)
-        elif not self.episode.actions:
-            raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
-        elif message.what == "actions":
-            name += "-actions.npz"
-            actions, touched = stacked(self.episode.actions, self.env.spec.patch), np.array(self.episode.touched, str)
-            np.savez_compressed(file, actions=actions, seed=self.episode.seed, touched=touched)
+        elif not history.actions:
+            raise ValueError(f"{what} must be of at least one step, got none since the reset")
+        elif what == "actions":
+            name, actions = f"{name}-actions.npz", history.actions
+            if len({action.shape for action in actions}) > 1:  # as executed, on the patch
+                actions = [bicubic(torch.from_numpy(each), self.env.spec.patch).numpy() for each in actions]
+            touched = np.array(history.touched, str)
+            np.savez_compressed(file, actions=np.stack(actions), seed=history.seed, touched=touched)
         else:
             name += ".html"
-            file.write(self.episode.recording.page().encode())
+            file.write(history.recording.page().encode())
         return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
 
-    def _apply_back(self, message: protocol.Back) -> Answers:
+    def _go_back(self) -> Answers:
         if self.saved is None:
             raise ValueError("there is no moment to go back to: save one first")
-        snapshot, episode = self.saved
-        self.episode, self.seed = episode.copy(), episode.seed  # what came after it did not happen
+        snapshot, history = self.saved
+        self.history, self.seed = history.copy(), history.seed  # what came after it did not happen
         self.observation, state = self.env.load(snapshot), self.env.env_state
-        values = physics_values(self.physics, self.env.num_particles, state.centre[:, 0])
+        values, then = physics_values(self.physics, self.env.num_particles, state.centre[:, 0]), state.physics
         self.env.env_state = replace(state, physics=values)
         self.grip, self.shot = None, self.env.shot()
-        if not same_physics(state.physics, values):
-            self.episode.note(CHANGED_MATTER)
+        if values.keys() != then.keys() or not all(torch.equal(values[name], then[name]) for name in values):
+            self.history.note(CHANGED_MATTER)
         return [{"type": "reset"}]
 
-    def _apply_draw(self, message: protocol.Draw) -> Answers:
+    def _draw(self, message: protocol.Draw) -> Answers:
         size = round(len(message.pixels) ** 0.5)
         if size**2 != len(message.pixels):
             raise ValueError(f"pixels must be those of a square, got {len(message.pixels)}")
@@ -334,7 +364,7 @@ class Session:
             try:
                 self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
                 self._reset(self.seed)
-                self._apply_policy(protocol.Policy(self.policy_name))
+                self._choose_policy(self.policy_name)
             except Exception:  # a task or a policy of the user's may raise anything
                 vars(self).update(old)
                 raise

@@ -1,24 +1,25 @@
-"""``python -m dittogym.play TASK``: a page in the browser to play with a robot."""
+"""``python -m cfp.play TASK``: a page in the browser to play with a robot."""
 
 from __future__ import annotations
 
-import pkgutil
+import contextlib
 import secrets
 import sys
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 import tyro
 
+from cfp.errors import ConfigError
+from cfp.experiment.cli import read_command, run_command
+from cfp.policy import load, read_policy, shipped
 from dittogym.tasks import check_task
 
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
-FROM_POLICY = ("dt", "substeps", "dtype", "parity", "target", "variant")
-
-#: Options that the help shows.
+FROM_POLICY = ("dt", "substeps", "dtype", "target", "variant")
 EXAMPLES = ("run", "--policy runs/kick", "shapematch --target M --particles 1000", "run --body robot.png")
 
 
@@ -47,19 +48,12 @@ class Command:
     """Open the page in a browser."""
 
 
-def load_policy(path: str) -> Any:
-    """A policy of any kind. The packages that load them depend on this one, so they are looked up by name."""
-    kind = pkgutil.resolve_name("cfp.policy:read_policy")(path)[1]["kind"]
-    return pkgutil.resolve_name("cfp:load" if kind == "cfp" else "baselines:load")(path)
-
-
-def options(command: Command) -> dict[str, Any]:
-    """Arguments of :class:`dittogym.play.session.Session`."""
-    weights = pkgutil.resolve_name("cfp.policy")
-    known = {name: weights.read_policy(name)[1] for name in weights.shipped()}
+def options(command: Command, load: Callable[[str], Any] = load) -> dict[str, Any]:
+    """Arguments of :class:`cfp.play.session.Session`; ``load`` reads a policy."""
+    known = {name: read_policy(name)[1] for name in shipped()}
     chosen: dict[str, Any] = {}
     if command.policy is not None:
-        known[command.policy] = weights.read_policy(command.policy)[1]
+        known[command.policy] = read_policy(command.policy)[1]
         environment = known[command.policy]["environment"]
         chosen = {name: environment[name] for name in FROM_POLICY if environment.get(name) is not None}
     task = command.task or (known[command.policy]["task"] if command.policy else "run")
@@ -67,46 +61,37 @@ def options(command: Command) -> dict[str, Any]:
     names = [name for name, about in known.items() if about["task"] == task or name == command.policy]
     given = {name: getattr(command, name) for name in ("particles", "resolution", "seed", "policy", "target", "body")}
     chosen |= {name: value for name, value in given.items() if value is not None}
-    return chosen | {"task": task, "policies": {name: partial(load_policy, name) for name in names}}
+    return chosen | {"task": task, "policies": {name: partial(load, name) for name in names}}
 
 
-def play(command: Command) -> None:
+def play(command: Command, load: Callable[[str], Any] = load) -> None:
     """Serve the page until Ctrl-C."""
     try:
-        from dittogym.play.server import Server
-        from dittogym.play.session import Session
+        from cfp.play.server import Server
+        from cfp.play.session import Session
     except ModuleNotFoundError as error:
-        raise OSError(f"the page needs a web server: pip install torchmpm[play] ({error})") from error
+        raise ConfigError(f"the page needs a web server: pip install torchmpm[play] ({error})") from error
     try:
-        new_session = partial(Session, **options(command))
+        new_session = partial(Session, **options(command, load))
         new_session()  # what is wrong with the options shows before a page is opened
-    except (TypeError, pkgutil.resolve_name("cfp:CFPError")) as error:
-        raise ValueError(str(error)) from error
-    try:
         server = Server(new_session, secrets.token_urlsafe(16), command.port)
-    except OSError as error:
-        raise OSError(f"port: {command.port} cannot be used ({error.strerror})") from error
+    except (TypeError, ValueError) as error:
+        raise ConfigError(str(error)) from error
     print(f"Play at {server.address}\nCtrl-C stops the program.", flush=True)
     if command.browser:
         webbrowser.open(server.address)
-    server.run()
+    with contextlib.suppress(KeyboardInterrupt):
+        server.run()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line entry; returns the exit code."""
-    console = arguments is None and sys.argv[0].startswith("torchmpm ")
-    program = sys.argv[0] if console else "python -m dittogym.play"
-    examples = "".join(f"\n  {program} {words}" for words in EXAMPLES)
-    description = f"{Command.__doc__}\n\nExamples:{examples}"
-    command = tyro.cli(Command, prog=program, description=description, args=arguments)
-    try:
-        play(command)
-    except KeyboardInterrupt:
-        return 0
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+def main(arguments: Sequence[str] | None = None, load: Callable[[str], Any] = load) -> int:
+    """Command line entry; returns the exit code.
+
+    Args:
+        arguments: Of the command line.
+        load: Reads a policy by its name or path; :func:`baselines.load` knows those of other algorithms, too.
+    """
+    return run_command(lambda: play(read_command(Command, "cfp.play", EXAMPLES, arguments), load))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 // The connection to the program: JSON both ways, binary frames from it.
 
-const LOW = -0.5, SPAN = 2, HIDDEN = 65535;
-
 export class Link {
   constructor(handlers) {
     this.handlers = handlers;
@@ -32,17 +30,14 @@ function decode(buffer, flags) {
     return array;
   };
   const [number, step, echo, bits, rows, width, count, resolution, gate] = take(Uint32Array, 9);
-  const [originX, originY, x, y, cornerX, cornerY, total, rate] = take(Float32Array, 8);
-  const frame = { number, step, echo, resolution, origin: [originX, originY], centre: [x, y], corner: [cornerX, cornerY], total, rate };
+  const [x, y, cornerX, cornerY, total, rate] = take(Float32Array, 6);
+  const frame = { number, step, echo, resolution, centre: [x, y], corner: [cornerX, cornerY], total, rate };
   flags.forEach((name, bit) => { frame[name] = Boolean(bits >> bit & 1); });
   frame.rewards = Array.from({ length: rows }, () => take(Float32Array, width).slice());  // not a view, which would keep the frame
-  frame.positions = take(Uint16Array, 2 * count);
-  frame.colours = take(Uint8Array, count);
+  frame.positions = take(Float32Array, 2 * count);
+  frame.codes = take(Uint8Array, count);
   frame.observation = take(Uint8Array, 3 * 64 * 64);
   frame.action = take(Int8Array, 2 * resolution ** 2);
   frame.gate = take(Uint8Array, 2 * gate ** 2);
   return frame;
 }
-
-// Where a coordinate that was sent lies in the world, m; NaN for a particle that is elsewhere.
-export const world = (value, origin) => value === HIDDEN ? NaN : origin + LOW + value / (HIDDEN - 1) * SPAN;

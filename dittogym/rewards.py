@@ -1,24 +1,116 @@
-"""Operations that the rewards of all tasks are made of (DittoGym, appendix on tasks)."""
+"""Rewards: what a task's reward function gets and returns, and the operations that it is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from dittogym.observation.image import silhouette, soft_silhouette
-from torchmpm import checks
+from dittogym.observation import silhouette, soft_silhouette
+from torchmpm import ParticleState
 from torchmpm.materials.linalg import safe_sqrt
 
-#: The spread of a robot is not counted beyond this, m.
+#: The radius of gyration of a torn robot is not counted beyond this, m.
 SPLIT_CAP = 0.2
-#: Width of a smooth transition, as a fraction of the limit.
+#: Width of a smooth step, as a fraction of the limit.
 RELATIVE_WIDTH = 0.05
 #: Distance over which the weight of a particle falls off where the choice of the nearest is smooth, m.
 SELECTION_WIDTH = 0.005
+
+#: What a task remembers during an episode: tensors by name, with a leading B.
+TaskState: TypeAlias = Mapping[str, Tensor]
+
+
+class Features(NamedTuple):
+    """Averages over the bodies of a state.
+
+    Attributes:
+        com: (B, 2) mean position of the robot's particles in the world, m.
+        velocity: (B, 2) their mean velocity, m/s.
+        radius_of_gyration: (B,) spread of the robot, sqrt(Var x + Var y), m.
+        object_com: (B, 2) mean position of the object's particles, m; ``None`` in tasks without an object.
+        object_velocity: (B, 2) their mean velocity, m/s.
+    """
+
+    com: Tensor
+    velocity: Tensor
+    radius_of_gyration: Tensor
+    object_com: Tensor | None = None
+    object_velocity: Tensor | None = None
+
+
+def features_of(particles: ParticleState, num_robot_particles: int) -> Features:
+    """Averages over the robot, whose particles come first, and over the object if there is one."""
+    x, v = particles.x, particles.v
+    robot, other = slice(None, num_robot_particles), slice(num_robot_particles, None)
+    com = x[:, robot].mean(1)
+    variance = (x[:, robot] - com[:, None]).square().mean(1).sum(-1)  # several times faster than Tensor.var
+    radius = safe_sqrt(variance)
+    if num_robot_particles == x.shape[1]:
+        return Features(com, v[:, robot].mean(1), radius)
+    return Features(com, v[:, robot].mean(1), radius, x[:, other].mean(1), v[:, other].mean(1))
+
+
+class Transition(NamedTuple):
+    """What a reward function may look at after a step. Do not change its tensors in place: they belong to the state.
+
+    Attributes:
+        particles: The state of all particles.
+        num_robot_particles: The robot's particles come first.
+        now: Averages after the step.
+        start: Averages right after the reset.
+        observation: (B, 3, 64, 64) uint8, or for a smooth reward that of :func:`dittogym.core.soft_observation`.
+        task_state: What the task remembers, tensors with a leading B.
+        ops: Operations that have a smooth form, see :class:`RewardOps`.
+    """
+
+    particles: ParticleState
+    num_robot_particles: int
+    now: Features
+    start: Features
+    observation: Tensor
+    task_state: TaskState
+    ops: RewardOps
+
+    @property
+    def robot_x(self) -> Tensor:
+        """Positions (B, n, 2) of the robot's particles, m."""
+        return self.particles.x[:, : self.num_robot_particles]
+
+    @property
+    def object_com(self) -> Tensor:
+        """Mean position (B, 2) of the object's particles, m.
+
+        Raises:
+            ValueError: The task has no object.
+        """
+        if self.now.object_com is None:
+            raise ValueError("object_com needs a task with an object, got one without")
+        return self.now.object_com
+
+
+class Reward(NamedTuple):
+    """What a reward function returns.
+
+    Attributes:
+        terms: Reward terms (B,) by name. The environment multiplies each by its weight in ``TaskSpec.weights`` and adds
+            the terms ``split``, ``action``, ``alive`` and ``failure``.
+        terminated: (B,) bool, the task's own reasons to end the episode; ``None`` if there are none.
+        success: (B,) bool; ``None`` where success is not defined.
+        info: Further quantities for ``info``, with a leading B.
+        task_state: Replaces the task's state, leading B, with the same names and shapes; ``None`` keeps it. Tensors of
+            int64 of shape (B, K) hold particle indices, which planners with fewer particles translate.
+    """
+
+    terms: Mapping[str, Tensor]
+    terminated: Tensor | None = None
+    success: Tensor | None = None
+    info: Mapping[str, Tensor] | None = None
+    task_state: TaskState | None = None
 
 
 @dataclass(frozen=True)
@@ -51,9 +143,9 @@ class RewardOps:
         if low is not None and high is not None and low > high:
             raise ValueError(f"low must be at most high, {high}, got {low}")
         limits = [(limit, sign) for limit, sign in ((high, 1.0), (low, -1.0)) if limit is not None]
-        if width is not None:
-            checks.number("width", width, above=0.0)
-        elif limits and not any(limit for limit, _ in limits):
+        if width is not None and not width > 0:
+            raise ValueError(f"width must be positive, got {width!r}")
+        if width is None and limits and not any(limit for limit, _ in limits):
             raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
         if not self.smooth:
             return z.clamp(low, high) if limits else z
@@ -65,17 +157,18 @@ class RewardOps:
 
     def heaviside(self, z: Tensor, width: float) -> Tensor:
         """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``, with a positive ``width``."""
-        checks.number("width", width, above=0.0)
+        if not width > 0:
+            raise ValueError(f"width must be positive, got {width!r}")
         return torch.sigmoid(z / width) if self.smooth else (z > 0).to(z.dtype)
 
-    def split_penalty(self, split: Tensor, limit: float) -> Tensor:
-        """Penalty ``-(20 s)^2``, (B,), once the spread s (B,) exceeds ``limit``.
+    def split_penalty(self, radius: Tensor, limit: float) -> Tensor:
+        """Penalty ``-(20 r)^2``, (B,), once the radius of gyration r (B,), m, exceeds ``limit``.
 
-        The exact form counts s up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
+        The exact form counts r up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
         keeps growing.
         """
-        counted = split if self.smooth else split.clamp_max(SPLIT_CAP)
-        return -(20.0 * counted).square() * self.heaviside(split - limit, RELATIVE_WIDTH * limit)
+        counted = radius if self.smooth else radius.clamp_max(SPLIT_CAP)
+        return -(20.0 * counted).square() * self.heaviside(radius - limit, RELATIVE_WIDTH * limit)
 
     def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
         """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
@@ -92,9 +185,8 @@ class RewardOps:
         Returns:
             (B, K).
         """
-        checks.number("fraction", fraction, above=0.0)
-        if fraction > 1:
-            raise ValueError(f"fraction must be at most 1, got {fraction}")
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must be above 0 and at most 1, got {fraction!r}")
         if not self.smooth:
             return pick(values, nearest(x.detach(), point.detach(), fraction)).mean(1)
         squared = _squared_distance(x, point)

@@ -1,4 +1,4 @@
-// The observation of all simulations in one call: the arithmetic of dittogym/observation/raster.py in the same order.
+// The observation of all simulations in one call: the arithmetic of dittogym/observation.py in the same order.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -9,11 +9,11 @@
 
 #include "team.hpp"
 
-// As in dittogym/observation/image.py and raster.py.
+// As in dittogym/observation.py.
 constexpr int SIZE = 64, BLOCK = 8, RASTER = 1024, FRAME = 3;
 constexpr int FINE = SIZE * BLOCK, WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
 
-// As `class Picture` in __init__.py. Tensors are contiguous, of Real; where nothing else is said leading batch.
+// As `class Picture` in observation.py. Tensors are contiguous, of Real; where nothing else is said leading batch.
 struct Picture {
     int64_t batch, particles, threads, pixels;
     Pool pool;

@@ -1,7 +1,7 @@
 """Replays recorded episodes of the reference implementation and lists how far ours is from them.
 
 ``reference.npz`` beside this file holds an extract of the recordings, so that every clone can compare with them.
-``python tests/dittogym/reference.py`` writes it from the complete recordings.
+``PYTHONPATH=.:tests python tests/dittogym/recordings.py`` writes it from the complete recordings.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import reference
 import torch
 
-import dittogym
-from dittogym import core
+from dittogym import make_spec
 from dittogym.action import patch_field, place
-from dittogym.window import centre_in_window
+from dittogym.geometry import centre_in_window
 from torchmpm.boundary import constrain
 from torchmpm.grid import PAD
 from torchmpm.substep import grid_velocity, particles_to_grid
@@ -101,28 +101,18 @@ def extract(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
-def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
-    """The environment that a file was recorded with, in reference parity."""
+def make(data: dict[str, np.ndarray]) -> reference.ReferenceEnv:
+    """The environment that a file was recorded with, after a reset."""
     config = json.loads(str(data["config"]))
     task, resolution = config["task"].split("-")
-    env = dittogym.TorchEnv(
-        task,
-        1,
-        resolution,
-        particles=tuple(config["particle_num_list"]),
-        dtype="float64" if config["f64"] else "float32",
-        parity="reference",
-        **options,
-    )
-    env.reset(seed=0)
-    if "x0" in data:
-        # Not through the option "positions": one file parks particles that it does not need outside the window.
-        env.env_state, _ = core.reset(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
+    dtype = "float64" if config["f64"] else "float32"
+    env = reference.make(task, resolution, particles=tuple(config["particle_num_list"]), dtype=dtype)
+    env.reset(seed=0, options={"positions": data["x0"]} if "x0" in data else None)
     return env
 
 
-def action(data: dict[str, np.ndarray], env: dittogym.TorchEnv, step: int) -> torch.Tensor:
-    return torch.as_tensor(data["actions"][step].reshape(1, *env.action_shape)).to(env.dtype)
+def action(data: dict[str, np.ndarray], env: reference.ReferenceEnv, step: int) -> np.ndarray:
+    return data["actions"][step].reshape(env.action_space.shape)
 
 
 def worst(ours: torch.Tensor | np.ndarray, theirs: np.ndarray) -> float:
@@ -132,8 +122,8 @@ def worst(ours: torch.Tensor | np.ndarray, theirs: np.ndarray) -> float:
 def substep_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference of every recorded quantity after 1, 10 and 100 substeps of the first action."""
     env = make(data)
-    start, solver = env.env_state, env.model.solver
-    recorded = torch.as_tensor(data["sub1_grid_actuation"]).permute(2, 0, 1)[None].to(env.dtype)
+    start, solver = env.torch_env.env_state, env.torch_env.model.solver
+    recorded = torch.as_tensor(data["sub1_grid_actuation"]).permute(2, 0, 1)[None].to(env.state.x)
     errors, state, done = _first_grid(data, env, recorded), start.particles, 0
     for count in (1, 10, 100):
         state = solver.step(state, recorded, substeps=count - done, origin=start.origin)
@@ -145,11 +135,12 @@ def substep_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     return errors
 
 
-def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: torch.Tensor) -> dict[str, float]:
+def _first_grid(data: dict[str, np.ndarray], env: reference.ReferenceEnv, recorded: torch.Tensor) -> dict[str, float]:
     """Actuation, mass and velocity on the nodes in the first substep."""
-    spec, solver, start = env.spec, env.model.solver, env.env_state
-    patch = patch_field(action(data, env, 0), spec.patch, spec.max_actuation)
-    ours = place(patch, centre_in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
+    spec, solver, start = env.torch_env.spec, env.torch_env.model.solver, env.torch_env.env_state
+    first = torch.as_tensor(action(data, env, 0))[None].to(env.state.x)
+    patch = patch_field(first, spec.patch, spec.max_actuation)
+    ours = place(patch, centre_in_window(spec.patch_centre, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
     grid = particles_to_grid(scene, start.particles.planes())
     along = torch.stack(interpolate(grid.nodes, scene.actuation), -1)[0]
@@ -172,27 +163,28 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
 def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference over the recorded episode, in the measure that :data:`EPISODE` names."""
     env = make(data)
-    robot = env.model.num_robot_particles
+    inner = env.torch_env
+    robot = inner.model.num_robot_particles
     rows: dict[str, list[Any]] = {name: [] for name in EPISODE}
     for t in range(len(data["actions"])):
         observation, reward, terminated, _, info = env.step(action(data, env, t))
         x, v, F = env.state.x[0, :robot], env.state.v[0], env.state.F[0, :robot]
-        rows["com"].append(info["com"][0])
+        rows["com"].append(info["com"])
         if "object_com" in info:
-            rows["com_object"].append(info["object_com"][0])
-        rows["anchor"].append(env.env_state.origin[0])
+            rows["com_object"].append(info["object_com"])
+        rows["anchor"].append(inner.env_state.origin[0])
         rows["x_std"].append(x.std(0, correction=0))
         rows["v_mean"].append(v[:robot].mean(0))
-        rows["reward"].append(reward[0])
-        rows["terminated"].append(terminated[0])
-        rows["action_norm"].append(env._actuation.flatten(2).norm(dim=2).sum())
+        rows["reward"].append(reward)
+        rows["terminated"].append(terminated)
+        rows["action_norm"].append(inner._actuation.flatten(2).norm(dim=2).sum())
         rows["kinetic"].append(0.5 * (torch.as_tensor(data["mass"]) * v.square().sum(-1)).sum())
         rows["det_F_mean"].append(torch.linalg.det(F).mean())
-        rows["obs"].append(observation[0])
-    ours = {name: torch.stack(values).numpy() for name, values in rows.items() if values}
+        rows["obs"].append(observation)
+    ours = {name: np.stack(values) for name, values in rows.items() if values}
     ours["obs"] = ours["obs"][:: data.get("image_stride", 1)]
     errors = {name: worst(values, data[name]) for name, values in ours.items()}
-    if env.spec.name in SHARES and robot != env.spec.robot.count:
+    if inner.spec.name in SHARES and robot != make_spec(inner.spec.name).robot.count:
         del errors["reward"]
     else:
         errors["reward"] /= max(float(np.ptp(data["reward"])), 10.0)

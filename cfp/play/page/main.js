@@ -1,12 +1,12 @@
 // The page: what its controls send, and what is drawn of each frame.
-import { table } from "./discs.js";
 import { Link } from "./link.js";
-import { Images, Plot } from "./panels.js";
-import { Scene } from "./scene.js";
 import { Pad } from "./pad.js";
+import { Images, Plot } from "./panels.js";
+import { legend, table } from "./scene.js";
+import { Stage } from "./stage.js";
 
 const $ = (id) => document.getElementById(id);
-const scene = new Scene($("scene")), plot = new Plot($("plot"), $("terms"));
+const scene = new Stage($("scene")), plot = new Plot($("plot"), $("terms"));
 const observation = new Images($("observation"), ["occupancy", "velocity →", "velocity ↑"]);
 const actions = new Images($("action"), ["horizontal", "vertical"]);
 const gates = new Images($("action"), ["gate, hor.", "gate, vert."]);
@@ -32,7 +32,7 @@ const link = new Link({
     policy = task.policy ?? policy;
     pad.setTask(task);
     $("back").disabled = !task.saved;
-    legend();
+    showScale();
     if (!matterSet()) setMatter();
   },
   terms({ names }) { plot.setTerms(names); },
@@ -64,7 +64,7 @@ function show() {
   stats.frames++;
   link.send("seen", { frame: frame.number });
   const start = performance.now();
-  scene.draw(frame, ui);
+  scene.show(frame, ui);
   stats.draw = 0.9 * (stats.draw ?? 0) + 0.1 * (performance.now() - start);
   if (presses.has(frame.echo)) {
     stats.latencies.push(performance.now() - presses.get(frame.echo));
@@ -120,11 +120,7 @@ function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(anchor.href), 1000);
 }
 
-function legend() {
-  const scale = task.scales[ui.colour], words = ui.colour === "muscle" ? scale.label.split(" to ") : [scale.low, `${scale.high} ${scale.label}`];
-  [$("low").textContent, $("high").textContent] = words;
-  $("ramp").style.background = `linear-gradient(to right, ${scale.stops.map((stop) => `rgb(${stop})`)})`;
-}
+function showScale() { legend(task.scales[ui.colour], $("low"), $("ramp"), $("high")); }
 
 // Muscles that are driven by hand should be seen, unless something else was chosen.
 function showMuscles() { if (!chosen && ui.colour !== "muscle") setColour("muscle"); }
@@ -132,7 +128,7 @@ function showMuscles() { if (!chosen && ui.colour !== "muscle") setColour("muscl
 function setColour(by) {
   ui.colour = $("colour").value = by;
   link.send("colour", { by });
-  legend();
+  showScale();
 }
 
 function setTool(tool) {

@@ -16,21 +16,21 @@ from typing import Any
 import torch
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import Headers, MutableHeaders, QueryParams
+from starlette.datastructures import Headers, QueryParams
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from dittogym.play import protocol
-from dittogym.play.session import Answers, Session
+from cfp.play import protocol
+from cfp.play.session import Answers, Session
+from dittogym.render.replay import SCENE
 from torchmpm import checks
 
-PAGE = Path(__file__).parent / "page"
+#: The files of the page by name.
+FILES = {path.name: path for path in (*(Path(__file__).parent / "page").iterdir(), SCENE)}
 HOSTS = ["127.0.0.1", "localhost"]
 #: Frames a second, and frames that may be on their way to a page.
 FRAMES_PER_SECOND, IN_FLIGHT = 60, 3
@@ -65,15 +65,9 @@ class Server:
     def __init__(self, new_session: Callable[[], Session], token: str, port: int) -> None:
         self.new_session, self.token = new_session, token
         self.connections: set[Connection] = set()
-        app = Starlette(
-            routes=[
-                Route("/", self.page),
-                WebSocketRoute("/ws", self.play),
-                Mount("/page", StaticFiles(directory=PAGE)),
-            ],
-            # Not under other names of this machine.
-            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS), Middleware(WithHeaders)],
-        )
+        routes = [Route("/", self.page), Route("/page/{name}", self.file), WebSocketRoute("/ws", self.play)]
+        # Not under other names of this machine.
+        app = Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)])
         self._socket = socket.create_server((HOSTS[0], checks.whole("port", port, 0, 65535)))
         self.port: int = self._socket.getsockname()[1]
         options: dict[str, Any] = {"log_level": "warning", "ws_max_size": protocol.LARGEST_MESSAGE, "lifespan": "off"}
@@ -97,7 +91,13 @@ class Server:
         """Serve the page."""
         if not has_token(request.query_params, self.token):
             return PlainTextResponse("Open the address that the program printed; it ends in a token.", 403)
-        return FileResponse(PAGE / "index.html")
+        return FileResponse(FILES["index.html"], headers=HEADERS)
+
+    async def file(self, request: Request) -> Response:
+        """Serve what the page loads."""
+        if (path := FILES.get(request.path_params["name"])) is None:
+            return PlainTextResponse("There is no such file.", 404)
+        return FileResponse(path, headers=HEADERS)
 
     async def play(self, websocket: WebSocket) -> None:
         """Play with a page until it is closed."""
@@ -116,23 +116,6 @@ class Server:
             await connection.run(self.new_session)
         finally:
             self.connections.discard(connection)
-
-
-class WithHeaders:
-    """Middleware that adds :data:`HEADERS` to all responses."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        await self.app(scope, receive, send_with_headers)
 
 
 def has_token(query: QueryParams, token: str) -> bool:
@@ -159,10 +142,9 @@ class Connection:
         # Torch's threads belong to the thread that calls it. One robot gains nothing from several, and the browser
         # needs the other cores.
         executor = ThreadPoolExecutor(1, "play", torch.set_num_threads, (1,))
-        simulation = asyncio.create_task(self.simulate(new_session, executor))
-        reader = asyncio.create_task(self.read())
+        tasks = [asyncio.create_task(self.simulate(new_session, executor)), asyncio.create_task(self.read())]
         try:
-            done, _ = await asyncio.wait((simulation, reader), return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         except WebSocketDisconnect:
@@ -171,9 +153,9 @@ class Connection:
             log.exception("the simulation of a page has failed")
             await self.websocket.close(1011)
         finally:
-            simulation.cancel()
-            reader.cancel()
-            await asyncio.gather(simulation, reader, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             executor.shutdown(wait=False, cancel_futures=True)
 
     async def read(self) -> None:
@@ -200,8 +182,9 @@ class Connection:
         loop = asyncio.get_running_loop()
         session = await loop.run_in_executor(executor, new_session)
         await self.websocket.send_json({"type": "hello", **session.describe()})
-        terms, pace, fresh = list(session.terms), Pace(session.control_step), True
+        terms, pace = list(session.terms), Pace(session.control_step)
         while True:
+            start = time.perf_counter()
             messages, self.inbox = self.inbox, []
             due = pace.due(session.speed if session.playing else 0.0)
             answers, taken = await loop.run_in_executor(executor, work, session, messages, due)
@@ -211,33 +194,26 @@ class Connection:
             if terms != list(session.terms):
                 terms = list(session.terms)
                 await self.websocket.send_json({"type": "terms", "names": terms})
-            if taken or messages or answers or fresh:
-                fresh = False
+            if taken or messages or answers or not self.sent:
                 await self.websocket.send_bytes(session.frame(pace.rate))
                 self.sent += 1
-            await self.wait(session.playing, pace)
-
-    async def wait(self, playing: bool, pace: Pace) -> None:
-        """Wait for the next frame, for a page that lags behind, and while time is stopped for a message."""
-        await asyncio.sleep(pace.left())
-        while self.sent - self.seen >= IN_FLIGHT or (not playing and not self.inbox):
-            self.news.clear()
-            await self.news.wait()
-            if not playing:
-                pace.restart()
+            await asyncio.sleep(max(0.0, start + 1 / FRAMES_PER_SECOND - time.perf_counter()))
+            # For a page that lags behind, and while time is stopped for a message.
+            while self.sent - self.seen >= IN_FLIGHT or (not session.playing and not self.inbox):
+                self.news.clear()
+                await self.news.wait()
 
 
 class Pace:
-    """Turns passing time into control steps that are due."""
+    """Turns passing time into control steps that are due, and measures how fast they are taken.
+
+    Attributes:
+        rate: Simulated seconds per second.
+    """
 
     def __init__(self, control_step: float) -> None:
-        self.control_step, self.rate, self._owed = control_step, 0.0, 0.0
-        self._taken, self._since = 0, time.perf_counter()
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the time in which nothing could happen."""
-        self._last = self._tick = time.perf_counter()
+        self.control_step, self.rate, self._owed, self._taken = control_step, 0.0, 0.0, 0
+        self._last = self._since = time.perf_counter()
 
     def due(self, speed: float) -> int:
         """Control steps that are due at so many simulated seconds per second; what cannot be caught up is dropped."""
@@ -254,11 +230,6 @@ class Pace:
         if (passed := time.perf_counter() - self._since) > AVERAGED:
             self.rate = self._taken * self.control_step / passed
             self._taken, self._since = 0, time.perf_counter()
-
-    def left(self) -> float:
-        """Seconds until the next frame."""
-        self._tick = max(self._tick + 1 / FRAMES_PER_SECOND, time.perf_counter() - 1 / FRAMES_PER_SECOND)
-        return max(0.0, self._tick - time.perf_counter())
 
 
 def work(session: Session, messages: list[protocol.Message], due: int) -> tuple[Answers, int]:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from typing import Annotated, Literal, TypeAlias
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from dittogym.play.hand import Direction
+from cfp.play.hand import Direction
 
 #: Largest size of a message from the page, bytes.
 LARGEST_MESSAGE = 2**18
-#: Positions are sent as 16 bits per coordinate, within this range around the window's origin, m.
-LOW, HIGH = -0.5, 1.5
-#: Stands for a particle that is elsewhere.
-HIDDEN = 65535
-#: The head of a frame: whole numbers, then floating point ones; see :func:`pack_frame`.
-HEAD = struct.Struct("<9I8f")
+#: The head of a frame: its number, the control steps of the episode, the id of the last :class:`Hand`, flags, and sizes
+#: S, K, N, R and G; then the robot's centre (x, y) and the lower left corner of the action image in the world, m, the
+#: return, and simulated seconds per second. After it come, little-endian, the return and the terms of the reward after
+#: each step since the last frame (S, K) float32; positions (N, 2) float32, m; codes of colours (N,) uint8; observation
+#: (3, 64, 64) uint8; action (2, R, R) int8; gate (2, G, G) uint8.
+HEAD = struct.Struct("<9I6f")
 
 #: Bounded, so that squares of distances are finite.
 Metres: TypeAlias = Annotated[float, Meta(ge=-1e4, le=1e4)]
@@ -139,27 +137,3 @@ def parse(text: str) -> Message:
     except msgspec.DecodeError as error:  # a ValueError in newer versions only
         raise ValueError(str(error)) from error
     return message
-
-
-def quantise(positions: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Positions (N, 2), m, as 16-bit whole numbers relative to the window's ``origin`` (2,), m."""
-    relative = (positions - origin - LOW) / (HIGH - LOW) * (HIDDEN - 1)
-    near = ((relative >= 0) & (relative <= HIDDEN - 1)).all(1, keepdims=True)  # false for NaN
-    return np.where(near, relative, HIDDEN).round().astype(np.uint16)
-
-
-def pack_frame(
-    counters: tuple[int, int, int, int], numbers: Sequence[float], rows: np.ndarray, arrays: Sequence[np.ndarray]
-) -> bytes:
-    """A frame for the page, little-endian; its head begins with the counters and the sizes S, K, N, R and G.
-
-    Args:
-        counters: Number of the frame, control steps of the episode, id of the last :class:`Hand`, and flags.
-        numbers: Origin (x, y) of the window, centre of the robot, lower left corner of the action image, m; return;
-            simulated seconds per second.
-        rows: Return and the terms of the reward after each step since the last frame, (S, K) float32.
-        arrays: Positions (N, 2) uint16; colour codes (N,) uint8; observation (3, 64, 64) uint8; action (2, R, R) int8;
-            gate (2, G, G) uint8, or empty.
-    """
-    sizes = (*rows.shape, len(arrays[0]), arrays[3].shape[-1], arrays[4].shape[-1])
-    return b"".join((HEAD.pack(*counters, *sizes, *numbers), rows.tobytes(), *(array.tobytes() for array in arrays)))

@@ -13,12 +13,11 @@ import torch
 
 import cfp
 from cfp import ActorPolicy, ActorSpec
+from cfp.play import protocol
+from cfp.play.hand import wave
+from cfp.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
+from cfp.play.session import FLAGS, Session
 from dittogym import TASKS, TorchEnv, make_spec
-from dittogym.play import protocol
-from dittogym.play.hand import MUSCLE_REACH, REACH, press, wave
-from dittogym.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
-from dittogym.play.session import FLAGS, Session
-from dittogym.render.replay import encode
 
 SMALL = {"particles": 200, "substeps": 10}
 
@@ -32,10 +31,16 @@ class Constant:
     description: dict[str, Any] = field(default_factory=dict)
 
     def predict(self, observation, state, episode_start, deterministic):
-        assert observation.shape == (1, 3, 64, 64) and deterministic
+        assert observation.shape == (1, 3, 64, 64) and deterministic == self.deterministic_by_default
         action = np.zeros((1, 2, self.resolution, self.resolution), np.float32)
         action[0, 0, 0] = 0.5  # the top row
         return action, (np.array([1 if state is None else state[0][0] + 1]),)
+
+
+def saved_file(played: Session, what: str) -> io.BytesIO:
+    """A file that is sent to the page."""
+    (answer,) = played.apply(Save(what))
+    return io.BytesIO(base64.b64decode(answer["content"]))
 
 
 def session(task: str = "run", **arguments: Any) -> Session:
@@ -50,8 +55,8 @@ def shown(played: Session) -> SimpleNamespace:
     result.flags = {name for bit, name in enumerate(FLAGS) if flags >> bit & 1}
     shapes = {
         "rows": ("<f4", (rows, width)),
-        "positions": ("<u2", (count, 2)),
-        "colours": ("u1", (count,)),
+        "positions": ("<f4", (count, 2)),
+        "codes": ("u1", (count,)),
         "observation": ("u1", (3, 64, 64)),
         "action": ("i1", (2, resolution, resolution)),
         "gate": ("u1", (2, gate, gate)),
@@ -75,9 +80,8 @@ def test_every_task_can_be_played(task: str) -> None:
         played.advance()
     frame, state = shown(played), played.env.env_state
     assert frame.step == 2 and "playing" in frame.flags and len(frame.rows) == 2
-    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[6]) == played.episode.total
-    sent = protocol.LOW + frame.positions / (protocol.HIDDEN - 1) * (protocol.HIGH - protocol.LOW) + frame.numbers[:2]
-    assert np.abs(sent - state.particles.x[0].numpy()).max() < 2e-5
+    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[4]) == played.history.total
+    assert np.array_equal(frame.positions, state.particles.x[0])
     assert np.array_equal(frame.observation, played.observation[0])
     assert len(shown(played).rows) == 0
 
@@ -100,48 +104,56 @@ def test_pulling_moves_matter_towards_the_pointer() -> None:
         assert played.grip is None
 
 
-@pytest.mark.parametrize("parity", ["clean", "reference"])
-def test_muscles_under_the_pointer(parity: str) -> None:
+def test_muscles_under_the_pointer() -> None:
     """The action has its largest value in the cell that holds the pointer, and acts there."""
-    played = session(resolution=16, parity=parity)
+    played = session(resolution=16)
     corner, cell = played._corner(), 0.5 / 16
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
         played.advance()
-        action = sign * played.episode.actions[-1]
+        action = sign * played.history.actions[-1]
         corner = played._corner()
         assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
         at = (played.shot.x[:, 0] - played.hand.x) ** 2 + (played.shot.x[:, 1] - played.hand.y) ** 2
         assert np.abs(played.shot.values["muscle"][at < 0.01**2] - 127.5).min() > 100
-    near = press(np.array((0.1, 0.2)), np.zeros(2), 0.5, 8)
-    assert near.shape == (2, 8, 8) and near.max() <= 1
 
 
 def test_paint_waves_and_policy_add_up() -> None:
-    policies = {"constant": Constant}
-    played = session(policies=policies, policy="constant")
+    played = session(policies={"constant": lambda: Constant(deterministic_by_default=False)}, policy="constant")
     played.apply(Paint("vertical", -1.0, [[3, 0], [3, 1]]))
     played.advance()
     expected = np.zeros((2, 4, 4))
     expected[0, 0], expected[1, 3, :2] = 0.5, -1.0
-    assert np.array_equal(played.episode.actions[-1], expected)
+    assert np.array_equal(played.history.actions[-1], expected)
     played.apply(protocol.Clear())
     played.apply(Wave("up"))
     played.advance()
-    assert np.allclose(
-        played.episode.actions[-1],
-        np.clip(wave("up", 1, 4) + Constant().predict(np.zeros((1, 3, 64, 64)), None, None, True)[0][0], -1, 1),
-    )
-    assert played.episode.memory[0][0] == 2
-    with pytest.raises(ValueError, match="cells must be rows and columns below 4"):
+    expected[1] = 0.0
+    assert np.allclose(played.history.actions[-1], np.clip(wave("up", 1, 4) + expected, -1, 1))
+    assert played.history.memory[0][0] == 2
+    with pytest.raises(ValueError, match="cells must"):
         played.apply(Paint("both", 1.0, [[4, 0]]))
-    with pytest.raises(ValueError, match="name must be one of constant, got '/etc/passwd'"):
-        played.apply(protocol.Policy("/etc/passwd"))
-    played.apply(protocol.Policy(None))
-    assert played.env.action_resolution == make_spec("run").coarse
+
+
+def test_a_policy_brings_its_resolution() -> None:
+    played = session(policies={"constant": Constant})
     before = played.env.state.x.clone()
     played.apply(protocol.Policy("constant"))
     assert torch.equal(before, played.env.state.x) and shown(played).action.shape == (2, 4, 4)
+    played.apply(protocol.Policy(None))
+    assert played.env.action_resolution == make_spec("run").coarse
+    with pytest.raises(ValueError, match="name must"):
+        played.apply(protocol.Policy("/etc/passwd"))
+
+
+def test_a_policy_that_cannot_act_changes_nothing() -> None:
+    broken = Constant()
+    broken.attached = lambda env: int("no")
+    played = session(policies={"broken": lambda: broken})
+    env = played.env
+    with pytest.raises(ValueError, match="invalid literal"):
+        played.apply(protocol.Policy("broken"))
+    assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
 
 
 def test_waves_travel() -> None:
@@ -156,7 +168,7 @@ def test_policies_with_other_orientations_and_gates() -> None:
     turned = Constant(description={"environment": {"action_layout": "grid"}})
     played = session(policies={"turned": lambda: turned}, policy="turned")
     played.advance()
-    assert (played.episode.actions[-1][0, :, 0] == 0.5).all() and played.episode.actions[-1].sum() == 2.0
+    assert (played.history.actions[-1][0, :, 0] == 0.5).all() and played.history.actions[-1].sum() == 2.0
     fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
     played = session(policies={"fine": lambda: fine}, policy="fine")
     played.advance()
@@ -176,97 +188,48 @@ def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
         }  # fmt: skip
         played.apply(Reset())
     played.apply(Matter(stiffness=1.0, yield_stress=1.0, gravity=9.0))
-    assert played.env.env_state.physics == {} and played.episode.touched
+    assert played.env.env_state.physics == {} and played.history.touched
     played.apply(Reset())
-    assert not played.episode.touched  # nothing but the actions decides about the episode
+    assert not played.history.touched  # nothing but the actions decides about the episode
     played.apply(Matter(stiffness=2.0, yield_stress=1.0, gravity=9.0))
     played.apply(Reset())
-    assert played.episode.touched == ["other matter or gravity"]
-    with pytest.raises(ValueError, match="dt must be at most"):
+    assert played.history.touched == ["other matter or gravity"]
+    with pytest.raises(ValueError, match="dt must"):
         played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
     played.advance()
 
 
-def test_saved_actions_repeat_an_episode() -> None:
-    played = session(resolution="coarse", seed=3)
-    played.apply(Wave("right"))
-    for _ in range(4):
-        played.advance()
-    (replay,) = played.apply(Save("replay"))
-    assert replay["name"] == "run-4.html" and b'"rewards":[' in base64.b64decode(replay["content"])
-    (answer,) = played.apply(Save("actions"))
-    saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
-    assert (
-        answer["name"] == "run-4-actions.npz" and saved["actions"].shape == (4, 2, 8, 8) and not len(saved["touched"])
-    )
-    env = TorchEnv("run", **SMALL)
-    env.reset(seed=int(saved["seed"]))
-    for action in saved["actions"]:
-        env.step(torch.from_numpy(action)[None])
-    assert torch.equal(env.state.x, played.env.state.x)
-
-
 def test_moments() -> None:
     played = session()
-    with pytest.raises(ValueError, match="save one first"):
+    with pytest.raises(ValueError, match="moment"):
         played.apply(protocol.Back())
     played.advance()
-    (answer,) = played.apply(Save("moment"))
-    snapshot = torch.load(io.BytesIO(base64.b64decode(answer["content"])), weights_only=True)
-    then, total = played.env.state.x.clone(), played.episode.total
+    snapshot = torch.load(saved_file(played, "moment"), weights_only=True)
+    then = played.env.state.x.clone()
     played.advance()
     played.apply(protocol.Back())
-    assert torch.equal(played.env.state.x, then) and shown(played).step == 1 and played.episode.total == total
-    played.advance()
-    header, _ = encode(played.episode.recording.scene, played.episode.recording.shots)
-    # Without what was played before going back.
-    assert header["steps"] == [0, 1, 2] and len(played.episode.actions) == 2
+    assert torch.equal(played.env.state.x, then) and shown(played).step == 1
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)
 
 
-def test_going_back_restores_success_and_failure() -> None:
-    played = session()
+def test_going_back_restores_the_outcome_and_the_memory_of_the_same_policy() -> None:
+    played = session(policies={"constant": Constant}, policy="constant")
     played.advance()
-    played.episode.success = played.episode.invalid = True
+    played.history.success = played.history.invalid = True
     played.apply(Save("moment"))
     played.apply(Reset())
-    assert not played.episode.success and not played.episode.invalid
+    played.advance()
+    played.advance()
+    assert not played.history.success and not played.history.invalid and played.history.memory[0][0] == 2
     played.apply(protocol.Back())
     played.apply(protocol.Play(True))
-    assert played.episode.success and played.episode.invalid and not played.playing
-
-
-def test_going_back_restores_the_memory_of_the_same_policy() -> None:
-    played = session(policies={"constant": Constant})
-    played.apply(protocol.Policy("constant"))
-    played.advance()
-    played.apply(Save("moment"))
-    played.advance()
-    played.apply(protocol.Back())
-    assert played.episode.memory[0][0] == 1
+    assert played.history.success and played.history.invalid and not played.playing
+    assert played.history.memory[0][0] == 1
     played.apply(protocol.Policy("constant"))
     played.apply(protocol.Back())
-    assert played.episode.memory is None
-
-
-def test_a_policy_as_stable_baselines3_has_it() -> None:
-    class Plain:
-        resolution = 4
-
-        def predict(self, observation, state=None, episode_start=None, deterministic=False):
-            assert not deterministic
-            return np.full((1, 2, 4, 4), 0.5, np.float32), state
-
-    played = session(policies={"plain": Plain}, policy="plain")
-    played.advance()
-    assert (played.episode.actions[-1] == 0.5).all()
-
-
-def test_the_reach_of_the_hand_follows_the_resolution() -> None:
-    fine, coarse = (session(resolution=size).describe()["reach"] for size in (32, 8))
-    assert fine == {"pull": REACH, "muscles": MUSCLE_REACH} and coarse["muscles"] == pytest.approx(0.6 * 0.5 / 8)
+    assert played.history.memory is None  # of another policy
 
 
 def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
@@ -275,18 +238,8 @@ def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
     played.apply(Save("moment"))
     played.apply(protocol.Matter(stiffness=2, yield_stress=1, gravity=9))
     assert played.apply(protocol.Back()) == [{"type": "reset"}]
-    assert played.episode.touched == ["other matter or gravity"]
+    assert played.history.touched == ["other matter or gravity"]
     assert played.describe()["saved"] and not session().describe()["saved"]
-
-
-def test_a_policy_that_cannot_act_changes_nothing() -> None:
-    broken = Constant(resolution=4)
-    broken.attached = lambda env: int("no")
-    played = session(policies={"broken": lambda: broken})
-    env = played.env
-    with pytest.raises(ValueError, match="invalid literal"):
-        played.apply(protocol.Policy("broken"))
-    assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
 
 
 def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
@@ -305,7 +258,7 @@ def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
         played.apply(protocol.Draw("body", np.full((64, 64), 255, np.uint8).tobytes()))
     assert vars(played) is not before and all(vars(played)[name] is value for name, value in before.items())
     played.advance()
-    assert len(played.episode.actions) == 2 and played.episode.recording.rewards
+    assert len(played.history.actions) == 2 and played.history.recording.rewards
 
 
 def test_files_after_going_back_are_of_what_led_there() -> None:
@@ -316,19 +269,19 @@ def test_files_after_going_back_are_of_what_led_there() -> None:
         for _ in range(3):
             played.advance()
     played.apply(Save("moment"))
-    kept, total = played.episode.actions.copy(), played.episode.total
+    kept, total = played.history.actions.copy(), played.history.total
     for reset in (None, None, Reset(seed=8)):
         if reset is not None:
             played.apply(reset)
         for _ in range(4):
             played.advance()
         played.apply(protocol.Back())
-        assert played.episode.total == pytest.approx(total) == sum(played.episode.recording.rewards)
-        assert [shot.step for shot in played.episode.recording.shots] == list(range(7))
+        assert played.history.total == pytest.approx(total) == sum(played.history.recording.rewards)
+        assert [shot.step for shot in played.history.recording.shots] == list(range(7))
         played.advance()
-        assert played.episode.total == pytest.approx(sum(played.episode.recording.rewards))
-    (answer,) = played.apply(Save("actions"))
-    saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
+        assert played.history.total == pytest.approx(sum(played.history.recording.rewards))
+    assert b'"rewards":[' in saved_file(played, "replay").read()
+    saved = np.load(saved_file(played, "actions"))
     assert np.array_equal(saved["actions"][:6], kept) and len(saved["actions"]) == 7 and saved["seed"] == 3
     assert not len(saved["touched"]), "the actions alone repeat the episode"
     env = TorchEnv("run", **SMALL)
@@ -353,9 +306,9 @@ def test_drawings() -> None:
     width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
     assert width / height == pytest.approx(2.0, rel=0.1) and played.env.spec.target[32, 32]
     before = played.env
-    with pytest.raises(ValueError, match="body must be a picture"):
+    with pytest.raises(ValueError, match="body must"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
-    with pytest.raises(ValueError, match="robot must lie inside the window"):
+    with pytest.raises(ValueError, match="robot must"):
         session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
     answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
@@ -367,9 +320,9 @@ def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
     for _ in range(31):
         played.advance()
     assert {"truncated", "playing"} <= shown(played).flags
-    total = played.episode.total
+    total = played.history.total
     played.advance()
-    assert played.episode.total == total
+    assert played.history.total == total
     played.env.state.v.fill_(torch.nan)
     played.advance()
     frame = shown(played)
@@ -385,7 +338,7 @@ def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
 def test_a_policy_that_fails_stops_time() -> None:
     broken = Constant(resolution=4)
     played = session(policies={"broken": lambda: broken}, policy="broken")
-    broken.predict = None  # type: ignore[method-assign]
+    broken.predict = None
     with pytest.raises(TypeError):
         played.advance()
     assert not played.playing
@@ -396,55 +349,32 @@ def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
     played = Session("shapematch", {"shapematch": lambda: policy}, "shapematch", particles="lite")
     for _ in range(30):
         played.advance()
-    assert played.episode.success and 350 < played.episode.total < 500
+    assert played.history.success and 350 < played.history.total < 500
 
 
-GOOD = [
-    '{"type": "play", "playing": false}',
-    '{"type": "hand", "tool": "pull", "x": 0.5, "y": 0.25, "id": 7}',
-    '{"type": "hand", "tool": null}',
-    '{"type": "reset"}',
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 3]]}',
-]
-BAD = {
-    "": "truncated",
-    "[" * 100_000: "Expected `object`, got `array`",
-    "{}": "missing required field `type`",
-    '{"type": ["play"]}': "Expected `str` - at `$.type`",
-    '{"type": "message"}': "Invalid value 'message' - at `$.type`",
-    '{"type": "play"}': "missing required field `playing`",
-    '{"type": "play", "playing": 1}': "Expected `bool`, got `int` - at `$.playing`",
-    '{"type": "step", "count": 9}': "unknown field `count`",
-    '{"type": "speed", "factor": 1e99}': "Expected `float` <= 16.0 - at `$.factor`",
-    '{"type": "speed", "factor": NaN}': "invalid character",
-    '{"type": "hand", "tool": "bite"}': "Invalid enum value 'bite' - at `$.tool`",
-    '{"type": "hand", "tool": "pull", "x": "0"}': "Expected `float`, got `str` - at `$.x`",
-    '{"type": "hand", "tool": "pull", "x": 1e999}': "Number out of range - at `$.x`",
-    '{"type": "hand", "tool": "pull", "y": 1e39}': "Expected `float` <= 10000.0 - at `$.y`",
-    '{"type": "hand", "tool": "pull", "id": -1}': "Expected `int` >= 0 - at `$.id`",
-    '{"type": "reset", "seed": 1.5}': "Expected `int | null`, got `float` - at `$.seed`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "length >= 1 - at `$.cells`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "length 2 - at `$.cells[0]`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[-1, 0]]}': "`int` >= 0 - at `$.cells[0][0]`",
-    '{"type": "policy", "name": 3}': "Expected `str | null`, got `int`",
-    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "Expected `float` > 0.0 - at `$.stiffness`",
-    '{"type": "save", "what": "../../x"}': "Invalid enum value '../../x' - at `$.what`",
-    '{"type": "draw", "what": "body", "pixels": "!"}': "Invalid base64 encoded string - at `$.pixels`",
-    '{"type": "draw", "what": "body", "pixels": "AAAA"}': "Expected `bytes` of length >= 64 - at `$.pixels`",
-    '{"type": "seen", "frame": true}': "Expected `int`, got `bool` - at `$.frame`",
-}
-
-
-@pytest.mark.parametrize("text", GOOD)
-def test_messages(text: str) -> None:
-    message = parse(text)
-    for name, value in json.loads(text).items():
-        told = type(message).__name__.lower() if name == "type" else getattr(message, name)
-        assert told == value or [list(cell) for cell in told] == value
-
-
-@pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
-def test_malformed_messages(text: str) -> None:
-    with pytest.raises(ValueError) as caught:
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("", "truncated"),
+        ("[" * 100_000, "object"),
+        ('{"type": "message"}', "type"),
+        ('{"type": "play"}', "playing"),
+        ('{"type": "step", "count": 9}', "count"),
+        ('{"type": "speed", "factor": 1e99}', "factor"),
+        ('{"type": "hand", "tool": "pull", "y": 1e39}', "y"),
+        ('{"type": "reset", "seed": -1}', "seed"),
+        ('{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}', "stiffness"),
+        ('{"type": "save", "what": "../../x"}', "what"),
+        ('{"type": "draw", "what": "body", "pixels": "AAAA"}', "pixels"),
+    ],
+    ids=range(11),
+)
+def test_malformed_messages(text: str, field: str) -> None:
+    with pytest.raises(ValueError, match=field) as caught:
         parse(text)
-    assert BAD[text] in str(caught.value) and len(str(caught.value)) < 300
+    assert len(str(caught.value)) < 300
+
+
+def test_messages() -> None:
+    assert parse('{"type": "hand", "tool": "pull", "x": 0.5, "id": 7}') == Hand("pull", 0.5, 0.0, 7)
+    assert parse('{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 3]]}') == Paint("both", 1, [(0, 3)])

@@ -1,6 +1,5 @@
 """The page in a real browser: what is shown, and what pointer, keys and buttons do to the simulation."""
 
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,22 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dittogym.play.server import Server
-from dittogym.play.session import Session
-
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip(f"no browser found, of {', '.join(BROWSERS)}")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield browser
-        browser.close()
+from cfp.play.server import Server
+from cfp.play.session import Session
 
 
 class Played:
@@ -125,10 +110,10 @@ def test_keys_and_brush(played: Played) -> None:
     played.until(lambda: int(session.env.env_state.steps[0]) == 0 and not session.painted.any())
     page.keyboard.down("ArrowRight")
     page.keyboard.press(".")
-    played.until(lambda: session.direction == "right" and len(session.episode.actions) == 1)
+    played.until(lambda: session.direction == "right" and len(session.history.actions) == 1)
     page.keyboard.up("ArrowRight")
     played.until(lambda: session.direction is None)
-    assert session.episode.actions[0].any() and page.input_value("#colour") == "muscle"
+    assert session.history.actions[0].any() and page.input_value("#colour") == "muscle"
 
 
 def test_sliders_and_files(played: Played) -> None:

@@ -1,0 +1,241 @@
+"""Episodes as arrays, to learn from: recording them, and files of them, NumPy archives and Minari datasets."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from dittogym.bodies.positions import MAX_SEED
+from dittogym.env import Env, as_tensor
+from dittogym.files import replacing
+from dittogym.render.recording import as_function, play
+from dittogym.torch_env import TorchEnv
+from torchmpm import checks
+
+__all__ = ["Episode", "load_episodes", "load_minari", "record", "save_episodes", "save_minari"]
+
+#: Attributes of :class:`torchmpm.ParticleState`.
+FIELDS = ("x", "v", "C", "F", "Jp")
+ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
+FORMAT, VERSION = "dittogym-episodes", 1
+#: What zipfile raises for damaged archives, besides ``OSError`` and ``EOFError``.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of T steps of a simulation of N particles.
+
+    Attributes:
+        observations: (T + 1, 3, 64, 64) uint8, from the reset to the end.
+        actions: (T, 2, R, R), as the policy chose them.
+        rewards: (T,).
+        terminations: (T,) bool, whether the task ended the episode.
+        truncations: (T,) bool, whether the time limit ended it.
+        particles: Of the states, by name: ``x`` (T + 1, N, 2) in m, ``v`` (T + 1, N, 2) in m/s, and others on request.
+        seed: Seed of the reset.
+        task: Name of the task.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+    particles: dict[str, np.ndarray]
+    seed: int
+    task: str
+
+
+def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x", "v")) -> Episode:
+    """Reset an environment, play an episode, and record it as arrays.
+
+    Args:
+        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package. Its wrappers
+            have no part in it.
+        policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
+        seed: Seed of the reset and of the policy's noise.
+        fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
+
+    Raises:
+        TypeError: The environment or the policy is of another kind.
+        ValueError: The environment has more than one simulation, or there is no such field.
+    """
+    seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
+    inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
+    torch_env = inner.torch_env if isinstance(inner, Env) else inner
+    if not isinstance(torch_env, TorchEnv):
+        raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
+    if torch_env.num_envs != 1:
+        raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
+    if unknown := [name for name in fields if name not in FIELDS]:
+        raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
+    choose, single = as_function(policy, torch_env.action_layout), isinstance(inner, Env)
+
+    def act(images: np.ndarray) -> Any:
+        return as_tensor(choose(images[0]), torch_env, single=True) if single else choose(images)
+
+    def state() -> list[np.ndarray]:
+        return [getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields]
+
+    observations, actions, ends, states = [], [], [], []
+    for images, chosen, end in play(torch_env, act, seed):
+        observations.append(images.copy())
+        states.append(state())
+        if chosen is not None:
+            actions.append(chosen.copy())
+            ends.append([value.item() for value in end[:3]])
+    rewards, terminations, truncations = (np.array(values) for values in zip(*ends, strict=True))
+    particles = {name: np.stack(values) for name, values in zip(fields, zip(*states, strict=True), strict=True)}
+    images, done = np.concatenate(observations), (terminations, truncations)
+    return Episode(images, np.concatenate(actions), rewards, *done, particles, seed, torch_env.spec.name)
+
+
+def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> Path:
+    """Write episodes to a compressed NumPy archive, and return its path.
+
+    The archive holds of each episode i arrays such as ``i/actions`` and ``i/particles/x``, and a JSON string ``about``
+    with seeds and tasks.
+
+    Args:
+        path: A file ``.npz``.
+        episodes: At least one.
+
+    Raises:
+        ValueError: The file has another suffix, or there is no episode.
+        TypeError: An item is not an :class:`Episode`.
+    """
+    file = Path(path)
+    if file.suffix != ".npz":
+        raise ValueError(f"path must end in .npz, got {str(path)!r}")
+    _check(episodes)
+    arrays: dict[str, Any] = {}
+    for i, episode in enumerate(episodes):
+        arrays |= {f"{i}/{name}": getattr(episode, name) for name in ARRAYS}
+        arrays |= {f"{i}/particles/{name}": values for name, values in episode.particles.items()}
+    listed = [{"seed": episode.seed, "task": episode.task, "fields": list(episode.particles)} for episode in episodes]
+    about = json.dumps({"format": FORMAT, "version": VERSION, "episodes": listed})
+    with replacing(file) as aside:
+        np.savez_compressed(aside, about=np.array(about), **arrays)
+    return file
+
+
+def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
+    """Read what :func:`save_episodes` wrote; nothing is unpickled.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ValueError: It is damaged, or not such a file.
+        FileNotFoundError: There is no such file.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            about = json.loads(str(archive["about"]))
+            if (about["format"], about["version"]) != (FORMAT, VERSION):
+                raise ValueError(f"its format is {about['format']} {about['version']}")
+            return [
+                Episode(
+                    **{name: archive[f"{i}/{name}"] for name in ARRAYS},
+                    particles={name: archive[f"{i}/particles/{name}"] for name in episode["fields"]},
+                    seed=episode["seed"],
+                    task=episode["task"],
+                )
+                for i, episode in enumerate(about["episodes"])
+            ]
+    except FileNotFoundError:
+        raise
+    except (OSError, LookupError, AttributeError, TypeError, ValueError, EOFError, *ZIP_ERRORS) as error:
+        form = f"a {FORMAT} file of version {VERSION}"
+        raise ValueError(f"path must be {form}, got {str(path)!r} ({error})") from error
+
+
+def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env[Any, Any], **metadata: Any) -> Any:
+    """Write episodes as a Minari dataset (HDF5), in which the particles are ``infos``. Needs the extra ``minari``.
+
+    Args:
+        dataset_id: Such as ``"dittogym/run/cfp-v0"``; Minari keeps it below ``MINARI_DATASETS_PATH``.
+        episodes: At least one.
+        env: The Gymnasium environment that they are of, which Minari makes anew from its specification.
+        metadata: Further arguments of ``minari.create_dataset_from_buffers``, such as ``algorithm_name``.
+
+    Returns:
+        The ``minari.MinariDataset``.
+
+    Raises:
+        ImportError: Minari or h5py is not installed.
+        ValueError: There is no episode, or they are of several tasks, or the environment has another task or other
+            actions.
+        TypeError: An item is not an :class:`Episode`, or the environment is not a Gymnasium environment of this
+            package.
+    """
+    minari = _minari()
+    _check(episodes)
+    if len(tasks := {episode.task for episode in episodes}) > 1:
+        raise ValueError(f"episodes must be of one task, got {', '.join(sorted(tasks))}")
+    inner: Any = getattr(env, "unwrapped", env)
+    if not isinstance(inner, Env):
+        raise TypeError(f"env must be a Gymnasium environment of this package, got {env!r}")
+    given = f"{inner.torch_env.spec.name} with actions {inner.action_space.shape}"
+    if given != (allowed := f"{episodes[0].task} with actions {episodes[0].actions.shape[1:]}"):
+        raise ValueError(f"env must be of task {allowed}, got {given}")
+    buffers = [
+        minari.data_collector.EpisodeBuffer(
+            id=i,
+            seed=episode.seed,
+            observations=list(episode.observations),
+            actions=list(episode.actions),
+            rewards=list(episode.rewards),
+            terminations=list(episode.terminations),
+            truncations=list(episode.truncations),
+            infos=dict(episode.particles),
+        )
+        for i, episode in enumerate(episodes)
+    ]
+    options = {"data_format": "hdf5", "jpeg_encoding": False, "description": episodes[0].task} | metadata
+    dataset = minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **options)
+    dataset.storage.update_metadata({"task": episodes[0].task})
+    return dataset
+
+
+def load_minari(dataset_id: str) -> list[Episode]:
+    """Read what :func:`save_minari` wrote: the dataset ``dataset_id``. Needs the extra ``minari``."""
+    dataset = _minari().load_dataset(dataset_id)
+    seeds = [about["seed"] for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
+    task = dataset.storage.metadata["task"]
+    return [
+        Episode(
+            **{name: np.asarray(getattr(episode, name)) for name in ARRAYS},
+            particles={name: np.asarray(values) for name, values in (episode.infos or {}).items()},
+            seed=int(seed),
+            task=task,
+        )
+        for episode, seed in zip(dataset.iterate_episodes(), seeds, strict=True)
+    ]
+
+
+def _check(episodes: Sequence[Episode]) -> None:
+    checks.instances("episodes", episodes, Episode)
+    if not episodes:
+        raise ValueError("episodes must hold at least 1 episode, got 0")
+
+
+def _minari() -> Any:
+    """The package Minari, which is an extra."""
+    try:
+        import h5py  # noqa: F401  (its format)
+        import minari
+        import minari.data_collector
+    except ModuleNotFoundError as error:
+        raise ImportError(f"Minari datasets need minari and h5py: pip install 'torchmpm[minari]' ({error})") from error
+    return minari
