@@ -26,14 +26,13 @@ from baselines.compare.report import SEES, t_interval
 from baselines.registry import configure, load, sees
 from cfp.config import EnvironmentConfig, RunConfig
 from cfp.errors import ConfigError
-from cfp.evaluation.table import Table, columns
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import read_json, write_json
 from cfp.hub import is_address
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy, check_trained_for, policy_file, shipped
 from cfp.registry import algo_of
-from cfp.weights import check_trained_for, policy_file, shipped
+from cfp.tables import Table, columns
 from dittogym import make_spec
 from dittogym.action import trained_layout
 

@@ -14,10 +14,7 @@ from torch import Tensor, nn
 
 from baselines.common.grid import GridConfig, long_dt
 from baselines.common.policies import StateBasedPolicy, load_network
-from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import ActorPolicy, Memory, image_policy
-from cfp.agent.networks import LATENT, Encoder, initialise
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import LATENT, Actor, ActorSpec, Encoder, initialise
 from cfp.analytic.critic import BETAS, Critic, StateFeatures, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig, WindowConfig
@@ -25,11 +22,20 @@ from cfp.envs.make import choose_device, make_env
 from cfp.envs.seeding import seeded
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.folder import start_path
-from cfp.files import write_policy
 from cfp.learner import Learner, NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
+from cfp.policy import (
+    KIND,
+    ActorPolicy,
+    Memory,
+    copy_policy,
+    load,
+    policy_for,
+    read_policy,
+    report_mismatch,
+    write_policy,
+)
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.validation import check_at_least
-from cfp.weights import KIND, copy_policy, load, policy_for, read_policy, report_mismatch
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -123,7 +129,7 @@ class StatePolicy(StateBasedPolicy):
     """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
 
     ``noise`` is the standard deviation before tanh of actions that are not deterministic; ``description`` says what the
-    policy is and where it comes from, see `cfp.weights.describe_run`.
+    policy is and where it comes from, see `cfp.policy.describe_run`.
     """
 
     def __init__(
@@ -269,7 +275,7 @@ class Shac(Resumable, UpdateLoop, Learner):
         deterministic = self.config.eval_deterministic
         if isinstance(self.actor, StateActor):
             return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
-        return image_policy(self.actor.spec, self.actor.actor, deterministic)
+        return ActorPolicy(self.actor.spec, deterministic, self.actor.actor)
 
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
@@ -308,7 +314,7 @@ class Shac(Resumable, UpdateLoop, Learner):
         policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
-        if policy.spec.encoder != "full":
+        if policy.spec.encoder != "paper":
             raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
         copy_policy(config.start_from, start_path(folder))
         return 1, 0

@@ -24,7 +24,7 @@ from torch.nn.functional import cosine_similarity
 from tqdm import tqdm
 
 from baselines.common.rollout import check_differentiable, rollout
-from cfp.evaluation.plots import write_figure
+from cfp.evaluation.page import write_figure
 from cfp.files import write_text
 from cfp.tables import csv_text
 from dittogym import TorchEnv

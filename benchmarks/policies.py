@@ -16,10 +16,9 @@ from typing import Any
 
 from cfp.config import RunConfig
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.returns import Result, evaluate, evaluation_seed, make_trial
-from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.evaluation.returns import Result, UntrainedPolicy, evaluate, evaluation_seed, make_trial
 from cfp.files import write_text
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy
 from cfp.tables import csv_text
 from cfp.train import PROGRAM
 

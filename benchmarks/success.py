@@ -14,8 +14,7 @@ from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
 from cfp.evaluate import open_policy
-from cfp.evaluation.episodes import Trial
-from cfp.evaluation.returns import decision_grid, evaluate, evaluation_seed
+from cfp.evaluation.returns import Trial, decision_grid, evaluate, evaluation_seed
 
 #: Episodes between two reports.
 BATCH = 20

@@ -18,8 +18,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from torch import Tensor
-from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
@@ -71,26 +69,9 @@ def minimum_seconds(function: Callable[[], object], repeats: int) -> float:
     return min(seconds[2:])
 
 
-def encode_one_by_one(encoders, *images: Tensor) -> Tensor:
-    """`cfp.agent.fused.encode` without joining encoders, and without the constant coordinates."""
-    latents = []
-    for encoder in encoders:
-        weights = encoder.first.weight[:, :-2].split([image.shape[1] for image in images], dim=1)
-        parts = [
-            F.conv2d(image, weight, stride=encoder.first.stride) for image, weight in zip(images, weights, strict=True)
-        ]
-        latents.append(encoder.rest(sum(parts[1:], parts[0])))
-    return torch.cat(latents, dim=1)
-
-
 def count_flop(model: CFP, batch: ReplayBufferSamples) -> int:
-    """Floating-point operations of an update: convolutions and matrix products of every network on its own."""
-    plain = mock.patch.multiple(
-        "cfp.agent.fused",
-        encode=encode_one_by_one,
-        decode=lambda heads, latent: [head(latent) for head in heads],
-        multilayer_perceptrons=lambda each, values: torch.stack([one(x) for one, x in zip(each, values, strict=True)]),
-    )
+    """Floating-point operations of an update: convolutions and matrix products of every head on its own."""
+    plain = mock.patch("cfp.agent.actor.decode", lambda heads, latent: [head(latent) for head in heads])
     with plain, FlopCounterMode(display=False) as counter:
         model.update(batch)
     return counter.get_total_flops()
@@ -134,12 +115,12 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 
 def former_quick(task: str) -> SACConfig:
-    """Options of the preset quick before its networks became lean."""
+    """Options of the preset quick before its networks became small."""
     learning = LearningConfig(
         batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
     )
     quick, paper = sac_preset(task, "quick"), sac_preset(task, "paper")
-    network = replace(quick.network, encoder="full")
+    network = replace(quick.network, encoder="paper")
     return replace(quick, resolutions=paper.resolutions, network=network, learning=learning)
 
 

@@ -3,12 +3,11 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cfp.agent.actor_policy import ActorPolicy
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import ActorSpec
 from cfp.config import AnalyticConfig, CoarseToFineConfig, Hyperparameters, SACConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
+from cfp.policy import ActorPolicy, load
 from cfp.presets import preset
-from cfp.weights import load
 
 if TYPE_CHECKING:
     from cfp.agent.features import ImageFeatures

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
 from typeguard import TypeCheckError, check_type
 
 import dittogym.tasks
-from cfp.agent.spec import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
+from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import brief, check_at_least, check_decay, check_fraction, check_positive
 from dittogym import make_spec
@@ -213,8 +213,8 @@ class StagedConfig(RunConfig):
     """Separate narrow encoders for observation and action."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
-    encoder: EncoderKind = "full"
-    """full (the paper's), or lean (half the size and width; actions join its features)."""
+    encoder: EncoderKind = "paper"
+    """paper (the paper's), or small (half the size and width; actions join its features)."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
     @property

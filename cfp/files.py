@@ -6,19 +6,14 @@ import errno
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import safetensors.torch
-from torch import Tensor
-
 from cfp.errors import ConfigError
 
 LARGEST_JSON = 2**20  # bytes
-#: Key of the description in the metadata of a policy file.
-FORMAT = "cfp-policy"
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool = False) -> None:
@@ -108,18 +103,3 @@ def write_json(path: Path, value: Any, shared: bool = False) -> None:
 def write_text(path: Path, text: str, shared: bool = False) -> None:
     """Write UTF-8 text, see `write_atomically`."""
     write_atomically(path, lambda file: file.write(text.encode()), shared)
-
-
-def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
-    """Write a policy of any kind: weights with the description, `cfp.weights.describe_run`'s and more, and its JSON.
-
-    Raises:
-        ConfigError: ``path`` does not end in ``.safetensors``.
-    """
-    path = Path(path)
-    if path.suffix != ".safetensors":
-        raise ConfigError(f"path must end in .safetensors, got {str(path)!r}")
-    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
-    write_atomically(path, lambda file: file.write(content))
-    write_json(path.with_suffix(".json"), description)

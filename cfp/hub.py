@@ -1,4 +1,4 @@
-"""Policies on the Hugging Face Hub: ``hf://OWNER/NAME``, with safetensors, hashes and model cards."""
+"""Policies on the Hugging Face Hub, ``hf://OWNER/NAME``, with model cards."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.files import write_text
 
 SCHEME = "hf://"
-FORM = f"{SCHEME}OWNER/NAME[@REVISION][?sha256=HASH]"
 _ADDRESS = re.compile(rf"{SCHEME}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?(?:\?sha256=([0-9a-f]{{64}}))?")
-#: Files of a repository, beside ``policy.json``; the hashes are as ``sha256sum`` writes them.
-POLICY, SUMS, CARD = "policy.safetensors", "SHA256SUMS", "README.md"
+FILE = "policy.safetensors"
 
 
 def is_address(path: object) -> bool:
@@ -28,7 +26,7 @@ def is_address(path: object) -> bool:
 
 @functools.cache  # a branch that moves means the same policy throughout a program
 def download(address: str) -> Path:
-    """Download a policy into the cache of huggingface_hub, check its hash, and print its revision and hash.
+    """Download a policy into the cache of huggingface_hub, and print the address of its commit.
 
     Args:
         address: ``hf://OWNER/NAME``, with ``@REVISION`` (a branch, a tag or a commit) and ``?sha256=HASH`` if wanted.
@@ -38,30 +36,26 @@ def download(address: str) -> Path:
 
     Raises:
         CheckpointError: The address has another form, nothing can be downloaded, or the file has another hash than
-            the address, or else ``SHA256SUMS`` in the repository, says.
+            the address says.
         ConfigError: huggingface_hub is not installed.
     """
     found = _ADDRESS.fullmatch(address)
     if found is None:
-        raise CheckpointError(f"path must have the form {FORM}, got {address!r}")
+        raise CheckpointError(f"path must have the form {SCHEME}OWNER/NAME[@REVISION][?sha256=HASH], got {address!r}")
     repo, revision, expected = found.groups()
     hub = _library()
     try:
-        folder = Path(hub.snapshot_download(repo, revision=revision, allow_patterns=[POLICY, SUMS]))
-        digest = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-        expected = expected or dict(line.split()[::-1] for line in (folder / SUMS).read_text().splitlines())[POLICY]
-    except (OSError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise CheckpointError(
-            f"{address}: cannot be downloaded with {SUMS} or the hash in the address ({reason})"
-        ) from error
-    if digest != expected:
-        raise CheckpointError(f"{address}: {POLICY} must have the SHA-256 {expected}, got {digest}")
-    print(f"{address}: {pinned(repo, folder.name, digest)}", file=sys.stderr)
-    return folder / POLICY
+        file = Path(hub.hf_hub_download(repo, FILE, revision=revision))
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    except Exception as error:  # without a network, also those of the library that carries the requests
+        raise CheckpointError(f"{address}: cannot be downloaded ({' '.join(str(error).split())})") from error
+    if expected not in (None, digest):
+        raise CheckpointError(f"{address}: {FILE} must have the SHA-256 {expected}, got {digest}")
+    print(f"{address}: {_pinned(repo, file.parent.name, digest)}", file=sys.stderr)
+    return file
 
 
-def pinned(repo: str, commit: str, digest: str) -> str:
+def _pinned(repo: str, commit: str, digest: str) -> str:
     """Address of one commit of a repository, with the hash of its policy."""
     return f"{SCHEME}{repo}@{commit}?sha256={digest}"
 
@@ -94,57 +88,46 @@ class Shareable:
         if "kind" not in self.description:
             raise ConfigError(f"policy must come from a run, got one with the description {self.description}")
         hub = _library()
-        with TemporaryDirectory() as name:
-            folder = Path(name)
-            self.save(folder / POLICY)
-            digest = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-            write_text(folder / SUMS, f"{digest}  {POLICY}\n")
-            write_text(folder / CARD, card(repo, self.description, results))
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / FILE
+            self.save(file)
+            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            write_text(Path(folder) / "README.md", _card(repo, self.description, results))
             try:
                 hub.create_repo(repo, private=private, exist_ok=True)
                 commit = hub.upload_folder(
                     repo_id=repo, folder_path=folder, commit_message=f"Policy for {self.description['task']}"
                 )
-            except Exception as error:  # without a network, errors of the library that carries its requests
+            except Exception as error:
                 raise ConfigError(f"repo: cannot push to {repo!r} ({' '.join(str(error).split())})") from error
-        return pinned(repo, commit.oid, digest)
+        return _pinned(repo, commit.oid, digest)
 
 
-def card(repo: str, description: Mapping[str, Any], results: Sequence[Mapping[str, Any]] = ()) -> str:
-    """The model card of a policy: what it is, how to use it, how it was trained, and its ``results``."""
-    package = "cfp" if description["kind"] == "cfp" else "baselines"
-    network = {name: value for name, value in description.items() if name not in ("format", "version", "environment")}
-    training = "\n".join(f"| {name} | `{value}` |" for name, value in (network | description["environment"]).items())
-    header = "---\nlibrary_name: torchmpm\npipeline_tag: reinforcement-learning\n"
-    text = f"""{header}tags: [reinforcement-learning, soft-robotics, torchmpm]
+def _card(repo: str, description: Mapping[str, Any], results: Sequence[Mapping[str, Any]]) -> str:
+    """The model card of a policy: what it is, how to use it, and its ``results``; ``policy.json`` has the options."""
+    kind, task = description["kind"], description["task"]
+    package = "cfp" if kind == "cfp" else "baselines"
+    rows = [
+        f"| {row['policy'].strip()} | {row['episodes']} | {row['mean']:,.1f} | {row['std']:,.1f} |" for row in results
+    ]
+    table = ["", "| policy | episodes | mean return | standard deviation |", "| --- | --- | --- | --- |", *rows, ""]
+    return f"""---
+library_name: torchmpm
+pipeline_tag: reinforcement-learning
+tags: [reinforcement-learning, soft-robotics, torchmpm]
 ---
 
-# {description["kind"]} on {description["task"]}
+# {kind} on {task}
 
-A policy of the algorithm `{description["kind"]}` for the task `{description["task"]}` of torchmpm, after
-{description["steps"]:,} environment steps.
+A policy of the algorithm `{kind}` for the task `{task}` of torchmpm, after {description["steps"]:,} environment steps
+with seed {description["seed"]}. The file `policy.json` holds the options of its training.
 
 ```python
 import {package}
 
 policy = {package}.load("{SCHEME}{repo}")
 ```
-
-## Training
-
-| option | value |
-| --- | --- |
-{training}
-"""
-    if results:
-        rows = "\n".join(
-            f"| {row['policy'].strip()} | {row['episodes']} | {row['mean']:,.1f} | {row['std']:,.1f} |"
-            for row in results
-        )
-        text += (
-            f"\n## Returns\n\n| policy | episodes | mean | standard deviation |\n| --- | --- | --- | --- |\n{rows}\n"
-        )
-    return text
+""" + ("\n".join(table) if rows else "")
 
 
 def _library() -> Any:

@@ -20,17 +20,23 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
 
-from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import ActorPolicy, image_policy
-from cfp.agent.lean import LeanEncoder
+from cfp.agent.actor import Actor, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.folder import policy_path, start_path
 from cfp.experiment.process import StopSignals
-from cfp.files import write_policy
-from cfp.policy_protocols import Policy
-from cfp.weights import KIND, copy_policy, load, policy_for, read_policy, report_mismatch
+from cfp.policy import (
+    KIND,
+    ActorPolicy,
+    Policy,
+    copy_policy,
+    load,
+    policy_for,
+    read_policy,
+    report_mismatch,
+    write_policy,
+)
 from dittogym import TorchEnv
 
 #: What a policy may look at: the observation; the full state; the simulator, to plan with; nothing.
@@ -276,7 +282,7 @@ class CoarseToFine(Learner):
     @property
     def trained_policy(self) -> ActorPolicy:
         """What has been learned so far."""
-        return image_policy(self.config.actor_spec(self.stage), self.trained_actor, self.config.eval_deterministic)
+        return ActorPolicy(self.config.actor_spec(self.stage), self.config.eval_deterministic, self.trained_actor)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
@@ -299,9 +305,9 @@ class CoarseToFine(Learner):
 
 
 def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
-    """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
+    """Copy a trained coarse actor into the new stage above it, and its small encoder too."""
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
-    if isinstance(actor.encoder, LeanEncoder):  # heads and critics start from trained features
+    if isinstance(actor.encoder, SmallEncoder):  # heads and critics start from trained features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())
 
 

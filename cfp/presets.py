@@ -14,7 +14,7 @@ from typing import Any
 import dittogym
 from cfp.config import AnalyticConfig, CoarseToFineConfig, Config, LearningConfig, Preset, SACConfig, check_task
 from cfp.errors import ConfigError
-from cfp.weights import load
+from cfp.policy import load
 
 #: Task of a command line that names none.
 DEFAULT_TASK = "shapematch"
@@ -215,7 +215,7 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
         "variant": None,
         "eval_deterministic": False,
         "interpolation": "half_pixel",
-        "encoder": "lean",
+        "encoder": "small",
         "batch_size": 64 if many else 128,
         "learning_rate": 5e-4,
         "gamma": 0.95,
@@ -248,9 +248,9 @@ def like_start(base: Config, values: dict[str, Any]) -> Config:
         return base
     if {option.name for option in dataclasses.fields(base)} <= values.keys():  # those of a run, whose start may be gone
         return base
-    spec, lean = load(values["start_from"]).spec, base.encoder == "lean"
+    spec, lean = load(values["start_from"]).spec, base.encoder == "small"
     base = replace(base, encoder=spec.encoder)
-    if isinstance(base, SACConfig) and lean and spec.encoder != "lean":
+    if isinstance(base, SACConfig) and lean and spec.encoder != "small":
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average")}
         base = replace(base, gradient_steps=4, batch_size=64, noise_cells=0, max_episode_steps=None, **usual)
         if len(base.resolutions) > 1:

@@ -10,9 +10,8 @@ from typing import Any
 from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
 from cfp.learner import Learner
-from cfp.policy_protocols import Policy
+from cfp.policy import KIND, Policy, policy_file, read_policy
 from cfp.presets import DEFAULT_TASK, default_algo, like_start
-from cfp.weights import KIND, policy_file, read_policy
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.learner.Learner`.
 ALGORITHMS: dict[str, str] = {

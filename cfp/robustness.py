@@ -16,15 +16,13 @@ from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, rea
 from cfp.envs.make import batch_size
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
-from cfp.evaluation.episodes import Trial
-from cfp.evaluation.plots import write_figure
-from cfp.evaluation.results import numbers
-from cfp.evaluation.returns import Result, decision_grid, evaluate, evaluation_seed
-from cfp.evaluation.table import Column, Table
+from cfp.evaluation.page import write_figure
+from cfp.evaluation.returns import Result, Trial, decision_grid, evaluate, evaluation_seed, numbers
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import write_json, write_text
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy
+from cfp.tables import Column, Table
 from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
 

@@ -17,7 +17,7 @@ from cfp.experiment.process import Stopped, keep_memory
 from cfp.experiment.training import from_python, train
 from cfp.files import parse_json
 from cfp.hub import Shareable
-from cfp.policy_protocols import Policy
+from cfp.policy import Policy
 from cfp.tables import read_table
 from dittogym.render.recording import Recording, check_film
 

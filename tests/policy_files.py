@@ -2,8 +2,7 @@
 
 from dataclasses import asdict
 
-from cfp.files import write_policy
-from cfp.weights import KIND, describe_run
+from cfp.policy import KIND, describe_run, write_policy
 
 
 def describe_actor(config, stage, steps):

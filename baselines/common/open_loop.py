@@ -12,11 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from cfp.agent.actor_policy import Memory, Observation, Start
-from cfp.files import write_policy
 from cfp.hub import Shareable
 from cfp.learner import Learner, Scalars
-from cfp.weights import read_policy, report_mismatch
+from cfp.policy import Memory, Observation, Start, read_policy, report_mismatch, write_policy
 
 
 class OpenLoop(Shareable):

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.hub import Shareable
+from cfp.policy import Memory, Observation, Start
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 

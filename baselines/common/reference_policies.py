@@ -9,8 +9,8 @@ from torch import Tensor
 from baselines.common.grid import find_grid
 from baselines.common.open_loop import OpenLoop
 from cfp.config import RunConfig
-from cfp.evaluation.untrained import UntrainedPolicy
-from cfp.policy_protocols import Policy
+from cfp.evaluation.returns import UntrainedPolicy
+from cfp.policy import Policy
 from dittogym import make_spec
 from dittogym.action import ActionLayout, from_grid_layout
 

@@ -14,9 +14,8 @@ from baselines.compare.plan import Run, reference_config
 from baselines.registry import configure, sees
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
-from cfp.evaluation.episodes import Episode, play
-from cfp.evaluation.returns import evaluation_seed, make_trial
-from cfp.policy_protocols import Policy
+from cfp.evaluation.returns import Played, evaluation_seed, make_trial, play
+from cfp.policy import Policy
 from cfp.registry import algo_of
 
 #: Episodes after which an evaluation is written down, so that one that is stopped goes on from there.
@@ -36,7 +35,7 @@ class Protocol:
         return task in paper.WITHOUT_NOISE if self.noise == "paper" else self.noise == "without"
 
 
-def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> list[Episode]:
+def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> list[Played]:
     """Play an episode of a policy on each of some consecutive layouts in the environment of a run's options."""
     trial = make_trial(config, "", policy, len(layouts), deterministic=deterministic, seed=layouts[0])
     return play([trial])[0]

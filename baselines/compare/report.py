@@ -15,12 +15,10 @@ from matplotlib.figure import Figure
 
 from baselines.compare.evaluation import Protocol, read_evaluation
 from baselines.compare.plan import Run
-from cfp.evaluation.page import STYLE
-from cfp.evaluation.plots import write_figure
-from cfp.evaluation.table import Table, columns
+from cfp.evaluation.page import STYLE, write_figure
 from cfp.files import write_text
 from cfp.learner import Sees
-from cfp.tables import csv_text, read_table
+from cfp.tables import Table, columns, csv_text, read_table
 
 #: Steps (N,), increasing, and mean returns (N,) of the evaluations during a training.
 Curve = tuple[np.ndarray, np.ndarray]

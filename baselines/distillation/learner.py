@@ -27,8 +27,8 @@ from cfp.errors import NonFiniteError
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, copy_coarse_weights, linear_decay
+from cfp.policy import load
 from cfp.presets import sac_preset
-from cfp.weights import load
 from dittogym import make_spec
 
 #: Every scalar that ``Distill.update`` logs, and what it means.

@@ -23,8 +23,7 @@ from cfp.experiment.run import TrainingRun
 from cfp.files import read_json, write_json
 from cfp.hub import is_address
 from cfp.learner import Resumable
-from cfp.policy_protocols import Policy, SeesState
-from cfp.weights import check_trained_for, copy_policy, read_policy, shipped
+from cfp.policy import Policy, StatePolicy, check_trained_for, copy_policy, read_policy, shipped
 from dittogym import TorchEnv
 from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
 
@@ -54,7 +53,7 @@ class PolicyTeacher(Teacher):
     @torch.no_grad()
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """Mean actions (B, 2, R, R) of the policy."""
-        policy = self.policy.attached(env) if isinstance(self.policy, SeesState) else self.policy
+        policy = self.policy.attached(env) if isinstance(self.policy, StatePolicy) else self.policy
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)

@@ -18,11 +18,8 @@ from baselines.common.policies import StateBasedPolicy, load_network
 from baselines.modular.env import segment
 from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, unpack, visible_positions
-from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
-from cfp.agent.actor_policy import Memory
-from cfp.agent.networks import initialise, perceptron
-from cfp.files import write_policy
-from cfp.weights import read_policy, report_mismatch
+from cfp.agent.actor import Sample, SquashedActor, initialise, perceptron, sample_squashed_gaussian
+from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, trained_layout
 from dittogym.spec import TaskSpec
@@ -125,7 +122,7 @@ class SegmentPolicy(StateBasedPolicy):
     Args:
         actor: The network.
         nodes: Features and actions of segments.
-        description: What it is and where it comes from, see `cfp.weights.describe_run`.
+        description: What it is and where it comes from, see `cfp.policy.describe_run`.
     """
 
     change: Callable[[np.ndarray], np.ndarray] | None = None

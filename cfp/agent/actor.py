@@ -1,26 +1,373 @@
-"""The actors: a plain one, and one that refines the action of a frozen coarser one (paper, Section 4.2)."""
+"""The actors of the coarse-to-fine policy (paper, Section 4.2, Appendix B): their structure, networks and actions.
+
+Observations are images (3, 64, 64), actions are images (2, R, R) whose channels drive the x- and the y-muscles. The
+actor of stage 1 acts on a coarse grid; that of a later stage refines the action of the frozen coarser one.
+
+There are two sets of networks. Those of the paper give every actor and every critic an encoder of its own. The small
+ones share one encoder of half the size between actor and critics, after Yarats et al., "Mastering Visual Continuous
+Control" (DrQ-v2, ICLR 2022): the critics alone train it, and actions join its features.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from cfp.agent import fused
-from cfp.agent.composition import blend, compose
-from cfp.agent.lean import LeanEncoder, NetworkInput, Trunk, image_of
-from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
-from cfp.agent.spec import ActorSpec
+from cfp.errors import ConfigError
+from dittogym.action import bicubic
+from dittogym.geometry import NODES
+from dittogym.observation import SIZE
 
+Interpolation = Literal["half_pixel", "aligned"]
+EncoderKind = Literal["paper", "small"]
+
+#: Rows and columns of the observation, and of actions as input of the paper's encoders.
+IMAGE_SIZE = SIZE
+#: Number of entries of a latent image (32, 4, 4).
+LATENT = 32 * 4 * 4
+#: Channels of the small encoder's features (B, 16, 4, 4), and of those of an action.
+SMALL_WIDTH = 16
 #: Bounds of the standard deviation before tanh; the lower one keeps sampling stochastic.
 STD_BOUNDS = (0.1, 6.0)
-
-
 #: Bias of a standard deviation that is not trained: 0.105 before tanh, near the smallest that is allowed.
 STD_BIAS = -0.4
+
+_DOUBLE, _KEEP = (4, 2, 1), (3, 1, 1)  # (kernel, stride, padding) that double or keep the size
+_DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] = {
+    8: ((_DOUBLE, _KEEP, _KEEP), (32, 16, 8, 2)),
+    16: ((_DOUBLE, _DOUBLE, _KEEP), (32, 16, 8, 2)),
+    32: ((_DOUBLE, _DOUBLE, _DOUBLE), (32, 16, 8, 2)),
+    64: ((_DOUBLE, _DOUBLE, _DOUBLE, _DOUBLE), (32, 16, 8, 4, 2)),
+}
+#: Action grids R for which `make_head` has a decoder.
+RESOLUTIONS = (4, *_DECODERS)
+
+
+@dataclass(frozen=True)
+class ActorSpec:
+    """Structure of an actor with all of its stages.
+
+    Attributes:
+        resolutions: Action grid R of each stage, coarsest first; a single entry describes a plain (stage 1) actor.
+        gate_bias: Bias added to the gate logit, one for each residual stage (``len(resolutions) - 1`` values).
+        split: Separate narrow encoders for observation and action, for tasks in which the two images show different
+            places.
+        gate_scale: Largest gate value; the reference implementation uses 0.25 with split encoders and 1 otherwise.
+        interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` as the environment upsamples actions,
+            ``"aligned"`` (aligned corners) as the reference implementation does here.
+        patch: Size of the images on which a residual actor blends coarse and residual actions; None blends on the
+            grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
+            the coarser force field only if actions are blended at the size of the environment's patch.
+        encoder: ``"paper"`` for the paper's networks, ``"small"`` for the small ones.
+
+    Raises:
+        ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
+            match them.
+    """
+
+    resolutions: tuple[int, ...]
+    gate_bias: tuple[float, ...] = ()
+    split: bool = False
+    gate_scale: float = 1.0
+    interpolation: Interpolation = "half_pixel"
+    patch: int | None = None
+    encoder: EncoderKind = "paper"
+
+    def __post_init__(self) -> None:
+        """Check that the fields match each other."""
+        increasing = list(self.resolutions) == sorted(set(self.resolutions))
+        if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
+            given = f"{self.resolutions}; by default they follow from the task's coarse and fine"
+            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {given}")
+        finest, found, count = self.resolutions[-1], len(self.gate_bias), len(self.resolutions) - 1
+        if found != count:
+            raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")
+        if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
+            raise ConfigError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")
+
+    @property
+    def action_size(self) -> int:
+        """Rows and columns of the executed action: the patch of a residual actor, else the finest action grid."""
+        return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
+
+    @property
+    def critic_size(self) -> int:
+        """Rows and columns of actions as critics take them: small critics do not need the enlarged action."""
+        return self.resolutions[-1] if self.encoder == "small" else self.action_size
+
+
+# Layers.
+
+
+def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
+    """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
+
+    ``"half_pixel"`` is the environment's rule, with which a closed gate reproduces the coarse force field; the
+    reference implementation aligns corners here.
+    """
+    if action.shape[-1] == size:
+        return action
+    return bicubic(action, size, align_corners=interpolation == "aligned")
+
+
+def normalise_image(observation: Tensor) -> Tensor:
+    """Map uint8 pixels to [-1, 1] by ``s / 255 * 2 - 1``; floating-point images are returned as they are."""
+    if observation.is_floating_point():
+        return observation
+    return _channels_last(observation).float().mul_(2.0 / 255.0).sub_(1.0)
+
+
+def _channels_last(image: Tensor) -> Tensor:
+    """An image with its channels next to each other in memory, in which format convolutions are fastest."""
+    return image.contiguous(memory_format=torch.channels_last)
+
+
+def initialise(module: nn.Module) -> nn.Module:
+    """Initialise linear layers Xavier-uniform with zero bias; convolutions keep PyTorch's default."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    return module
+
+
+def perceptron(*sizes: int, norm: bool = False) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them, and ``norm`` before each ELU."""
+    layers: list[nn.Module] = [nn.Flatten()]
+    for before, after in pairwise(sizes[:-1]):
+        normalisation = [nn.LayerNorm(after, elementwise_affine=False)] if norm else []
+        layers += [nn.Linear(before, after), *normalisation, nn.ELU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
+
+
+class Encoder(nn.Module):
+    """Three convolutions from (B, C, size, size) to a latent image (B, w, 4, 4), with w, 2w and w channels.
+
+    Two constant channels, (row - 32)/32 and (column - 32)/32 if the size is 64, are appended to the input (the paper's
+    "position embedding channel"); they are neither trained nor saved.
+    """
+
+    patches: Tensor
+    """Coordinate channels in the receptive fields of the first layer, unfolded to (225, 2 kernel^2)."""
+
+    def __init__(self, channels: int, width: int, size: int = IMAGE_SIZE) -> None:
+        super().__init__()
+        kernel, stride = size // 8, size // 16
+        self.first = nn.Conv2d(channels + 2, width, kernel, stride)
+        self.rest = nn.Sequential(
+            nn.ELU(inplace=True),
+            nn.Conv2d(width, 2 * width, 4, stride=2),
+            nn.ELU(inplace=True),
+            nn.Conv2d(2 * width, width, 3),
+            nn.ELU(inplace=True),
+        )
+        line = (torch.arange(size) - size / 2) / (size / 2)
+        grid = torch.stack(torch.meshgrid(line, line, indexing="ij"))
+        self.register_buffer("patches", F.unfold(grid[None], kernel, stride=stride)[0].T.contiguous(), persistent=False)
+
+    def forward(self, *images: Tensor) -> Tensor:
+        """Encode images (B, c, size, size) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
+        return encode([self], *images)
+
+
+def encode(encoders: Sequence[Encoder], *images: Tensor) -> Tensor:
+    """Evaluate n encoders of the same shape on the same images (B, c, size, size); returns latents (B, n w, 4, 4).
+
+    One convolution a layer, with the channels of all encoders, is faster on a CPU than several small ones. The first
+    layer is linear in its channels, so that it is evaluated for each image and for the coordinates separately: no
+    constants are stacked with the images, and images that need no gradient get none.
+    """
+    sizes, stride = [image.shape[1] for image in images], encoders[0].first.stride[0]
+    weight, bias = _joined([encoder.first for encoder in encoders])
+    *weights, position = weight.split([*sizes, 2], dim=1)
+    coordinates = torch.addmm(bias, encoders[0].patches, position.flatten(1).T).flatten()
+    hidden, *others = (
+        (_folded_conv if image.requires_grad else F.conv2d)(_channels_last(image), part, stride=stride)
+        for image, part in zip(images, weights, strict=True)
+    )
+    # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
+    hidden += coordinates.expand(len(hidden), -1).unflatten(1, (15, 15, -1)).movedim(-1, 1)
+    for other in others:
+        hidden += other
+    for layers in zip(*(encoder.rest for encoder in encoders), strict=True):
+        if isinstance(layers[0], nn.Conv2d):
+            hidden = F.conv2d(hidden, *_joined(layers), stride=layers[0].stride, groups=len(encoders))
+        else:
+            hidden = layers[0](hidden)
+    return hidden
+
+
+def _joined(layers: Sequence[Any], dim: int = 0) -> tuple[Tensor, Tensor]:
+    """Weights and biases of layers of the same shape, weights concatenated along ``dim``."""
+    if len(layers) == 1:
+        return layers[0].weight, layers[0].bias
+    return torch.cat([layer.weight for layer in layers], dim), torch.cat([layer.bias for layer in layers])
+
+
+def _folded_conv(image: Tensor, weight: Tensor, stride: int) -> Tensor:
+    """``conv2d`` with a kernel of twice the stride, computed as a 2x2 kernel on blocks of stride x stride pixels.
+
+    On a CPU the gradient with respect to a two-channel image is five times faster, a training with the paper's
+    networks by a seventh.
+    """
+    out, channels = weight.shape[:2]
+    tiles = image.movedim(1, -1).unflatten(2, (-1, stride)).unflatten(1, (-1, stride))  # (B, rows, y, columns, x, c)
+    kernels = weight.view(out, channels, 2, stride, 2, stride).permute(0, 3, 5, 1, 2, 4)
+    return F.conv2d(tiles.transpose(2, 3).flatten(3).movedim(-1, 1), kernels.reshape(out, -1, 2, 2))
+
+
+class PairEncoder(nn.Module):
+    """Encode observation and action together, to a latent of (B, 32, 4, 4).
+
+    With ``split``, two encoders of half the width are used, for tasks in which the images show different places.
+    """
+
+    def __init__(self, split: bool) -> None:
+        super().__init__()
+        widths = ((3, 16), (2, 16)) if split else ((5, 32),)
+        self.encoders = nn.ModuleList(Encoder(channels, width) for channels, width in widths)
+
+    def forward(self, image: Tensor, patch: Tensor) -> Tensor:
+        """Encode a normalised observation (B, 3, 64, 64) and an upsampled action (B, 2, 64, 64)."""
+        if len(self.encoders) == 1:
+            latent: Tensor = self.encoders[0](image, patch)
+            return latent
+        return torch.cat([self.encoders[0](image), self.encoders[1](patch)], dim=1)
+
+
+def make_head(resolution: int) -> nn.Sequential:
+    """Decoder from the latent (B, 32, 4, 4) to an image (B, 2, R, R), without a final activation."""
+    if resolution == 4:
+        return nn.Sequential(*perceptron(LATENT, 128, 128, 2 * 4 * 4), nn.Unflatten(1, (2, 4, 4)))
+    shapes, channels = _DECODERS[resolution]
+    layers: list[nn.Module] = []
+    for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
+        layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU(inplace=True)]
+    return nn.Sequential(*layers[:-1])
+
+
+def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
+    """Evaluate heads of `make_head` on the same latent (B, 32, 4, 4); returns (B, 2, R, R) each.
+
+    One convolution a layer, with the weights of all heads, is faster on a CPU than several small ones: a training with
+    the paper's networks by a fifth.
+    """
+    if not isinstance(heads[0][0], nn.ConvTranspose2d):
+        return [head(latent) for head in heads]
+    first, *rest = zip(*heads, strict=True)
+    values = F.conv_transpose2d(_channels_last(latent), *_joined(first, 1), first[0].stride, first[0].padding)
+    for layers in rest:
+        if isinstance(layers[0], nn.ELU):
+            values = layers[0](values)
+            continue
+        blocks = torch.block_diag(
+            *(layer.weight.flatten(1) for layer in layers)
+        )  # each continues with its own channels
+        weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
+        bias = torch.cat([layer.bias for layer in layers])
+        values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
+    return [part.contiguous() for part in values.chunk(len(heads), dim=1)]
+
+
+# The small networks.
+
+
+class Encoded(NamedTuple):
+    """Observations that have been encoded already, for networks that share the encoder."""
+
+    image: Tensor  # `halved`, (B, 3, 32, 32)
+    features: Tensor  # (B, 16, 4, 4)
+
+    def detach(self) -> Encoded:
+        """The same without a gradient to the encoder."""
+        return self._replace(features=self.features.detach())
+
+
+NetworkInput: TypeAlias = Tensor | Encoded
+
+
+def image_of(observation: NetworkInput) -> Tensor:
+    """The images of observations."""
+    return observation.image if isinstance(observation, Encoded) else observation
+
+
+def halved(image: Tensor) -> Tensor:
+    """Normalised images (B, 3, 32, 32): means of 2 x 2 pixels of uint8 or normalised ones; others are done already."""
+    if image.shape[-1] < IMAGE_SIZE:
+        return image
+    pixels = image if image.is_floating_point() else image.short()
+    rows = pixels[..., ::2, :] + pixels[..., 1::2, :]
+    sums = rows[..., ::2] + rows[..., 1::2]
+    if image.is_floating_point():
+        return sums / 4
+    return _channels_last(sums).float().mul_(2.0 / (4 * 255.0)).sub_(1.0)
+
+
+class SmallEncoder(nn.Module):
+    """`Encoder` of half the size and width: 2 x 2 pixels are averaged, and features are (B, 16, 4, 4)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = Encoder(3, SMALL_WIDTH, IMAGE_SIZE // 2)
+
+    def forward(self, observation: NetworkInput) -> Tensor:
+        """Features of uint8, normalised or `halved` images; those of `Encoded` observations are known."""
+        if isinstance(observation, Encoded):
+            return observation.features
+        features: Tensor = self.layers(halved(observation))
+        return features
+
+
+class ActionEncoder(nn.Module):
+    """Features (B, channels, 4, 4) of actions (B, 2, R, R): one layer on each of 4 x 4 tiles of the action grid.
+
+    Larger actions are averaged over the cells of the grid. On the size of the environment's patch hundreds of weights
+    would see nearly the same value, and an update of Adam would move their sum by as many steps.
+    """
+
+    def __init__(self, resolution: int, channels: int) -> None:
+        super().__init__()
+        self.resolution, self.side = resolution, resolution // 4
+        self.layer = nn.Linear(2 * self.side**2, channels)
+
+    def forward(self, action: Tensor) -> Tensor:
+        """Encode actions."""
+        if action.shape[-1] != self.resolution:
+            action = F.adaptive_avg_pool2d(action, self.resolution)
+        tiles = action.unflatten(3, (4, self.side)).unflatten(2, (4, self.side))  # (B, 2, rows, y, columns, x)
+        return F.elu(self.layer(tiles.permute(0, 2, 4, 1, 3, 5).flatten(3))).movedim(-1, 1)
+
+
+class Trunk(nn.Module):
+    """The actor's own layer: from the encoder's features, and those of a coarse action, to a latent (B, 32, 4, 4).
+
+    Args:
+        resolution: Action grid R of the stage; None for the first stage, which reads no coarse actions.
+    """
+
+    def __init__(self, resolution: int | None = None) -> None:
+        super().__init__()
+        self.action = ActionEncoder(resolution, SMALL_WIDTH) if resolution else None
+        channels = LATENT // 16
+        self.mix = nn.Conv2d(2 * SMALL_WIDTH if resolution else SMALL_WIDTH, channels, 3, padding=1)
+        self.norm = nn.GroupNorm(1, channels)
+
+    def forward(self, features: Tensor, coarse: Tensor | None = None) -> Tensor:
+        """The latent for features (B, 16, 4, 4) and coarse actions (B, 2, R, R)."""
+        if self.action is not None:
+            assert coarse is not None
+            features = torch.cat([features, self.action(coarse)], dim=1)
+        return F.elu(self.norm(self.mix(features)))
+
+
+# Actions: their distribution, and how those of the stages are composed.
 
 
 class Outputs(NamedTuple):
@@ -57,7 +404,7 @@ class Sample(NamedTuple):
     action: Tensor  # to execute, (B, 2, A, A) with A from `ActorSpec.action_size`; may exceed [-1, 1] slightly
     log_prob: Tensor  # log-density of the sampled part, for a residual actor the residual action only, (B,)
     gate: Tensor | None  # weight of the residual action, (B, 2, R, R); None for a plain actor
-    parts: tuple[Tensor, ...] = ()  # of the action, see `cfp.agent.composition.Composition`
+    parts: tuple[Tensor, ...] = ()  # of the action, see `compose`
 
 
 def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
@@ -87,6 +434,22 @@ def sample_squashed_gaussian(
         noise = noise.normal_() if generator is None else torch.randn(mean.shape, generator=generator).to(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
+
+
+def blend(coarse: Tensor, residual: Tensor, gate: Tensor) -> Tensor:
+    """``g a_res + (1 - g) a_coarse``, of actions and gates that are upsampled already (paper, Section 4.2)."""
+    return gate * residual + (1 - gate) * coarse
+
+
+def compose(parts: Sequence[Tensor], size: int, interpolation: Interpolation) -> Tensor:
+    """Actions (B, 2, size, size) from their parts: the action of the first stage, then residual and gate of each."""
+    action, *rest = (upsample(part, size, interpolation) for part in parts)
+    for residual, gate in zip(rest[::2], rest[1::2], strict=True):
+        action = blend(action, residual, gate)
+    return action
+
+
+# The actors.
 
 
 class SquashedActor(nn.Module):
@@ -120,9 +483,9 @@ class Actor(SquashedActor):
     def __init__(self, resolution: int, spec: ActorSpec) -> None:
         super().__init__()
         self.resolution = resolution
-        lean = spec.encoder == "lean"
-        self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
-        self.trunk = Trunk() if lean else None
+        small = spec.encoder == "small"
+        self.encoder: nn.Module = SmallEncoder() if small else Encoder(3, 32)
+        self.trunk = Trunk() if small else None
         self.mean = make_head(resolution)
         self.std = make_head(resolution)
         initialise(self)
@@ -137,7 +500,7 @@ class Actor(SquashedActor):
         """Evaluate the networks for uint8 observations (B, 3, 64, 64).
 
         Args:
-            observation: The images; with a lean encoder also `cfp.agent.lean.Encoded`.
+            observation: The images; with the small networks also `Encoded`.
             deterministic: Whether a coarser actor acts without noise.
             generator: Of its noise; None for torch's own.
             size: Rows and columns on which coarse and residual actions are blended; None: `ActorSpec.action_size`.
@@ -146,7 +509,7 @@ class Actor(SquashedActor):
             latent = self.encoder(normalise_image(image_of(observation)))
         else:
             latent = self.trunk(self.encoder(observation))
-        mean, raw_std = fused.decode([self.mean, self.std], latent)
+        mean, raw_std = decode([self.mean, self.std], latent)
         return Outputs(mean, raw_std)
 
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
@@ -221,7 +584,7 @@ class ResidualActor(Actor):
             if size != self.resolution:
                 on_grid = compose(coarse.parts, self.resolution, self.interpolation)
             latent = self.trunk(self.encoder(observation), on_grid)
-        mean, raw_std, gate_logit = fused.decode([self.mean, self.std, self.gate], latent)
+        mean, raw_std, gate_logit = decode([self.mean, self.std, self.gate], latent)
         return Outputs(mean, raw_std, gate_logit, coarse)
 
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:

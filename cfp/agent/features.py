@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 
-from cfp.agent.networks import IMAGE_SIZE, LATENT, Encoder
+from cfp.agent.actor import IMAGE_SIZE, LATENT, Encoder
 
 
 class ImageFeatures(BaseFeaturesExtractor):

@@ -21,7 +21,7 @@ from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env
 from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
-from cfp.evaluation.pictures import policy_pictures
+from cfp.evaluation.page import policy_pictures
 from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, linear_decay, refines
 from cfp.presets import analytic_preset
 

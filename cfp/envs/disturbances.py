@@ -29,7 +29,7 @@ FRICTION = (0.0, 0.5, math.inf)
 class Case:
     """One disturbance; dropout and noise are drawn anew in each step.
 
-    A policy's decisions are the entries of its action grid, or those of `cfp.policy_protocols.DisturbablePolicy`.
+    A policy's decisions are the entries of its action grid, or those of `cfp.policy.DisturbablePolicy`.
     """
 
     name: str  # in tables and plots

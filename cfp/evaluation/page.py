@@ -1,4 +1,4 @@
-"""A page about a run that opens from disk: film, final table, curve, what was trained; nothing is fetched."""
+"""What is shown of a run: pictures of its policy, its learning curve, and a page that opens from disk."""
 
 from __future__ import annotations
 
@@ -10,17 +10,33 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import torchmpm
-from cfp.config import RunConfig, differences, to_json
-from cfp.evaluation.pictures import match_pictures
-from cfp.evaluation.results import to_rows
-from cfp.evaluation.returns import Result
-from cfp.evaluation.table import Table, columns
-from cfp.files import write_atomically, write_text
-from cfp.tables import read_table
-from dittogym.render.frame import png
-from dittogym.render.recording import Recording
+import cv2
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
 
+import torchmpm
+from cfp.agent.actor import Actor
+from cfp.config import RunConfig, differences, to_json
+from cfp.evaluation.returns import Result, to_rows
+from cfp.files import write_atomically, write_text
+from cfp.tables import Table, columns, read_table
+from dittogym.observation import silhouette
+from dittogym.render.frame import GROUND, TARGET, png
+from dittogym.render.recording import Recording
+from dittogym.render.scene import ROBOT
+
+#: Pictures of every evaluation (TensorBoard only), and what they show.
+PICTURES: dict[str, str] = {
+    "picture/observation": "what the first training robot shows: red occupancy, green and blue velocity in x and y",
+    "picture/action": "the mean action for it, x-muscles left, y-muscles right: red contracts, blue expands",
+    "picture/gate": "the gate of a residual actor in the same way: white keeps the coarse action, red replaces it",
+}
+
+#: Colour of the robot's pixels outside the target.
+MISPLACED = (206, 60, 52)
+SIZE = 192  # rows of a picture, pixels
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #282c34; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.7rem; } h2 { font-size: 1.3rem; margin-top: 2rem; } img, video { max-width: 100%; }
@@ -44,6 +60,112 @@ RESULTS = (
 OPTIONS = columns(option="option", own="this run", preset="preset")
 #: When the picture that a film shows before it plays was taken, as a share of the episode.
 POSTER_TIME = 0.6
+
+
+# Pictures of the policy.
+
+
+@torch.no_grad()
+def policy_pictures(actor: Actor, observation: Tensor) -> dict[str, np.ndarray]:
+    """Pictures, uint8 (H, W, 3), of one observation and what an actor makes of it without noise."""
+    sample = actor.sample(observation, deterministic=True)
+    pictures = {
+        "picture/observation": _enlarged(observation[0].permute(1, 2, 0).cpu().numpy()),
+        "picture/action": muscles(sample.action[0]),
+    }
+    if sample.gate is not None:
+        pictures["picture/gate"] = muscles(sample.gate[0])
+    return pictures
+
+
+def muscles(image: Tensor) -> np.ndarray:
+    """Both channels of an image (2, R, R) in [-1, 1] side by side, from blue through white to red, uint8 (H, W, 3)."""
+    values = image.float().clamp(-1, 1).cpu().numpy()
+    fading = 1 - np.abs(values)
+    colours = np.stack([np.where(values < 0, fading, 1), fading, np.where(values > 0, fading, 1)], axis=-1)
+    left, right = (_enlarged((255 * colour).round().astype(np.uint8)) for colour in colours)
+    return np.concatenate([left, np.zeros((SIZE, 2, 3), np.uint8), right], axis=1)
+
+
+def match_pictures(target: np.ndarray, observation: np.ndarray) -> tuple[dict[str, np.ndarray], float]:
+    """How well the robot matches a target (64, 64): pictures by name, and the intersection over union.
+
+    Args:
+        target: Bool.
+        observation: (3, 64, 64) uint8.
+    """
+    robot = silhouette(torch.from_numpy(observation)[None])[0].numpy()
+    layers = {
+        "target": [(target, TARGET)],
+        "result": [(robot, ROBOT)],
+        "overlap": [(target, TARGET), (robot, MISPLACED), (robot & target, ROBOT)],
+    }
+    pictures = {}
+    for name, painted in layers.items():
+        pictures[name] = np.full((*target.shape, 3), GROUND, np.uint8)
+        for mask, colour in painted:
+            pictures[name][mask] = colour
+    return pictures, float((robot & target).sum() / (robot | target).sum())
+
+
+def _enlarged(pixels: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.resize(np.ascontiguousarray(pixels), (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))
+
+
+# The learning curve.
+
+
+def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
+    """Draw training and evaluation returns over environment steps into ``curve.png``; returns its path."""
+    figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
+    training = read_table(run / "progress.csv", ("step", "stage"))
+    evaluations = read_table(run / "evaluations.csv", ("step", "mean", "std"))
+    steps, values = _column(training, "rollout/return")
+    if steps:
+        axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
+    steps, means = _column(evaluations, "mean")
+    _, stds = _column(evaluations, "std")
+    how = "without noise" if config.eval_deterministic else "with noise"
+    if steps:
+        axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
+    low, high = np.subtract(means, stds), np.add(means, stds)
+    axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
+    for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
+        axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)
+    for stage, step in _handovers(training):
+        before, after = config.resolution(stage), config.resolution(stage + 1)
+        axes.axvline(step, color="tab:green", linewidth=1)
+        label = f" {before}x{before} → {after}x{after}"
+        axes.text(step, 0.01, label, color="tab:green", fontsize=8, transform=axes.get_xaxis_transform())
+    axes.set(xlabel="environment steps", ylabel="return of an episode")
+    axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    write_figure(run / "curve.png", figure)
+    return run / "curve.png"
+
+
+def write_figure(path: Path, figure: Figure, shared: bool = False) -> None:
+    """Write a figure as PNG, see `cfp.files.write_atomically`."""
+    write_atomically(path, lambda file: figure.savefig(file, format="png"), shared)
+
+
+def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], list[float]]:
+    """Steps and values of a column, where it has a value."""
+    pairs = [(float(row["step"]), float(row[name])) for row in rows if row.get(name)]
+    return [step for step, _ in pairs], [value for _, value in pairs]
+
+
+def _handovers(rows: Sequence[dict[str, str]]) -> list[tuple[int, float]]:
+    """Number and last step of every stage but the newest; a run that starts from a policy lacks the first ones."""
+    last: dict[int, float] = {}
+    for row in rows:
+        last[int(row["stage"])] = float(row["step"])
+    return list(last.items())[:-1]
+
+
+# The page.
 
 
 def write_page(

@@ -1,27 +1,235 @@
-"""Evaluating policies: their returns on environments used for nothing else, beside those of untrained policies."""
+"""Evaluating policies: their returns on episodes used for nothing else, beside those of untrained policies.
+
+Episodes are played side by side on all cores, each with the result, to the last bit, that it has when played alone. On
+a CPU every episode has an environment and a thread of its own: the simulation then takes the same path whatever else is
+played, and an episode that has ended costs nothing. Policies act one after the other, because torch's generator, from
+which they take their noise, belongs to the whole process.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from threading import Event, Lock
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import torch
 from scipy.special import stdtrit  # scipy.stats takes a second to import
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
 
-from cfp.config import EVALUATION_SEED, EnvironmentConfig, RunConfig
+from cfp.config import EVALUATION_SEED, RunConfig
+from cfp.envs.disturbances import Disturbed
 from cfp.envs.make import batch_size, make_env
-from cfp.evaluation.episodes import Trial, play
-from cfp.evaluation.untrained import UntrainedPolicy
-from cfp.files import read_json
-from cfp.policy_protocols import Policy
+from cfp.envs.vec_env import TorchVecEnv
+from cfp.policy import DisturbablePolicy, Memory, Observation, Policy, Start, StatePolicy
+from dittogym.render.recording import seed_noise
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
-#: Returns of zero and random action by task, as committed in ``docs/leaderboard``; none of them succeeds.
-REFERENCE_RETURNS = Path(__file__).with_name("reference_returns.json")
+
+
+def evaluation_seed(config: RunConfig) -> int:
+    """Seed of the layouts of final evaluations, on which no policy was trained or chosen."""
+    return config.seed + 2 * EVALUATION_SEED
+
+
+def without_noise(policy: Policy, noise: Noise) -> bool:
+    """Whether a policy acts without noise."""
+    return policy.deterministic_by_default if noise == "default" else noise == "without"
+
+
+def decision_grid(policy: Policy) -> int:
+    """Rows and columns on which a policy decides; one of several stages returns an enlarged blend."""
+    return int(policy.description.get("resolution", policy.resolution))
+
+
+@dataclass(frozen=True)
+class UntrainedPolicy:
+    """Slack muscles, or actions uniform in [-1, 1], independent in every cell and step, from torch's generator."""
+
+    kind: Literal["zero", "random"]
+    resolution: int  # rows and columns R of its actions
+
+    uses_image = False
+
+    @property
+    def deterministic_by_default(self) -> bool:
+        """Whether it always does the same."""
+        return self.kind == "zero"
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """It comes from no training."""
+        return {}
+
+    def predict(
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
+        """Actions (B, 2, R, R), or (2, R, R) for a single image; ``deterministic`` changes nothing."""
+        single = isinstance(observation, np.ndarray) and observation.ndim == 3
+        shape = (*(() if single else (len(observation),)), 2, self.resolution, self.resolution)
+        actions = torch.zeros(shape) if self.kind == "zero" else 2.0 * torch.rand(shape) - 1.0
+        return actions.numpy(), state
+
+
+# Playing episodes.
+
+
+def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
+    """A policy for an environment: shown the state if it acts on that, and disturbed where it decides off a grid."""
+    inner = env.unwrapped
+    if isinstance(policy, DisturbablePolicy) and isinstance(env, Disturbed):
+        policy, env.disturbs_actions = policy.through(env.disturb), False
+    if isinstance(policy, StatePolicy) and isinstance(inner, TorchVecEnv):
+        return policy.attached(inner.torch_env)
+    return policy
+
+
+class SeededPolicy:
+    """A policy whose noise depends on nothing but the layout and the number of the step.
+
+    It acts with one thread, because with several torch adds up convolutions in another order.
+
+    Args:
+        policy: The policy.
+        layout: Seed of the (first) layout.
+        before_step: Called before each step.
+    """
+
+    _turn = Lock()
+
+    def __init__(self, policy: PolicyPredictor, layout: int, before_step: Callable[[], None] = lambda: None) -> None:
+        self.policy, self.layout, self.before_step = policy, layout, before_step
+        self.steps = 0
+
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
+        """Actions of the policy; reseeds torch's generator."""
+        self.before_step()
+        threads = torch.get_num_threads()
+        with self._turn:
+            torch.set_num_threads(1)
+            try:
+                seed_noise(self.layout, self.steps)
+                self.steps += 1
+                return self.policy.predict(*args, **kwargs)
+            finally:
+                torch.set_num_threads(threads)
+
+
+class Played(NamedTuple):
+    """How an episode went."""
+
+    total: float  # its undiscounted return
+    success: bool | None  # None where the task does not define success
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Some episodes of one policy, on the layouts from ``seed`` on."""
+
+    name: str
+    resolution: int  # of the grid on which it decides
+    policy: PolicyPredictor
+    make_env: Callable[[int, int], VecEnv]  # from the first layout and the number of layouts
+    episodes: int
+    deterministic: bool
+    seed: int
+    batch: int = 1  # episodes in one environment; more only on devices that are faster that way
+
+    def spans(self) -> list[tuple[int, int]]:
+        """First layout and number of layouts of each environment."""
+        return [
+            (self.seed + first, min(self.batch, self.episodes - first)) for first in range(0, self.episodes, self.batch)
+        ]
+
+    def play(self, first: int, count: int, before_step: Callable[[], None]) -> list[Played]:
+        """Play the episodes of a span, that of the first layout first."""
+        env = self.make_env(first, count)
+        successes: dict[int, bool | None] = {}
+
+        def note(local: dict[str, Any], _: dict[str, Any]) -> None:
+            if local["done"]:
+                successes[local["i"]] = local["info"].get("is_success")
+
+        acting = SeededPolicy(attached(self.policy, env), first, before_step)
+        env.seed(first)
+        returns, _ = evaluate_policy(
+            acting, env, count, deterministic=self.deterministic, callback=note, return_episode_rewards=True
+        )
+        assert isinstance(returns, list)
+        totals = dict(zip(successes, returns, strict=True))  # both in the order in which the episodes ended
+        return [Played(float(totals[i]), successes[i]) for i in range(count)]
+
+
+def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, deterministic: bool, seed: int) -> Trial:
+    """Episodes of a policy in the environment of a run."""
+    return Trial(
+        name=name,
+        resolution=decision_grid(policy),
+        policy=policy,
+        make_env=lambda _, count: make_env(config, policy.resolution, count),
+        episodes=episodes,
+        deterministic=deterministic,
+        seed=seed,
+        batch=batch_size(config, episodes),
+    )
+
+
+class EpisodesStopped(Exception):
+    """Another episode failed, or the program is being stopped."""
+
+
+def play(
+    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+) -> list[list[Played]]:
+    """Play the episodes of all trials, those of each in the order of their layouts.
+
+    Args:
+        trials: What to play.
+        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
+    """
+    spans = [(trial, *span) for trial in trials for span in trial.spans()]
+    threads, stop = torch.get_num_threads(), Event()
+    workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
+    total = (steps or 0) * sum(trial.episodes for trial in trials)
+    bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
+
+    def play_span(trial: Trial, first: int, count: int) -> list[Played]:
+        taken = 0
+
+        def before_step() -> None:
+            nonlocal taken
+            if stop.is_set() or should_stop():
+                raise EpisodesStopped
+            taken += count
+            bar.update(count)
+
+        torch.set_num_threads(1)
+        episodes = trial.play(first, count, before_step)
+        bar.update((steps or 0) * count - taken)
+        return episodes
+
+    with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:
+        futures = [pool.submit(play_span, *span) for span in spans]
+        try:
+            for future in wait(futures, return_when=FIRST_EXCEPTION).done:
+                future.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(threads)
+    played = iter(futures)
+    return [[episode for _ in trial.spans() for episode in next(played).result()] for trial in trials]
+
+
+# Their returns.
 
 
 @dataclass(frozen=True)
@@ -52,31 +260,6 @@ class Result:
         return float(stdtrit(count - 1, 0.975) * np.std(self.returns, ddof=1) / math.sqrt(count))
 
 
-def evaluation_seed(config: RunConfig) -> int:
-    """Seed of the layouts of final evaluations, on which no policy was trained or chosen."""
-    return config.seed + 2 * EVALUATION_SEED
-
-
-def decision_grid(policy: Policy) -> int:
-    """Rows and columns on which a policy decides; one of several stages returns an enlarged blend."""
-    return int(policy.description.get("resolution", policy.resolution))
-
-
-def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, deterministic: bool, seed: int) -> Trial:
-    """Episodes of a policy in the environment of a run."""
-    size = policy.resolution
-    return Trial(
-        name=name,
-        resolution=decision_grid(policy),
-        policy=policy,
-        make_env=lambda _, count: make_env(config, size, count),
-        episodes=episodes,
-        deterministic=deterministic,
-        seed=seed,
-        batch=batch_size(config, episodes),
-    )
-
-
 def evaluate(
     trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
 ) -> list[Result]:
@@ -97,25 +280,13 @@ def evaluate(
     return results
 
 
-def untrained(config: RunConfig, episodes: int) -> list[Result]:
-    """Returns of zero and random action: those of `REFERENCE_RETURNS` where they hold, else of episodes played now.
-
-    They hold in the tasks of the package with lite particles and default physics; the table has eight layouts of each.
-    """
-    table = read_json(REFERENCE_RETURNS).get(config.task)
-    without_influence = {name: getattr(config, name) for name in ("num_envs", "backend", "action_layout")}
-    kinds: tuple[Literal["zero", "random"], ...] = ("zero", "random")
-    if table and config.environment == EnvironmentConfig(**without_influence):
-        return [Result(f"{kind} action", table["resolution"], tuple(table[kind][:episodes]), 0.0) for kind in kinds]
-    options: dict[str, Any] = {"deterministic": True, "seed": evaluation_seed(config)}
-    policies = {f"{kind} action": UntrainedPolicy(kind, config.resolution(1)) for kind in kinds}
-    trials = [make_trial(config, name, policy, episodes, **options) for name, policy in policies.items()]
-    return evaluate(trials, config.make_spec().horizon)
-
-
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate policies, beside zero and random action; one made for a single layout also there."""
-    trials, seed = [], evaluation_seed(config)
+    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
+    coarsest, seed = config.resolution(1), evaluation_seed(config)
+    trials = [
+        make_trial(config, f"{kind} action", UntrainedPolicy(kind, coarsest), episodes, deterministic=True, seed=seed)
+        for kind in ("zero", "random")
+    ]
     for name, trained in policies.items():
         default = without_noise(trained, noise)
         for deterministic in (False, True) if noise == "both" else (default,):
@@ -124,9 +295,39 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         if "layout" in trained.description:
             own = trained.description["layout"]
             trials.append(make_trial(config, "  own layout", trained, 1, deterministic=default, seed=own))
-    return untrained(config, episodes) + evaluate(trials, config.make_spec().horizon)
+    return evaluate(trials, config.make_spec().horizon)
 
 
-def without_noise(policy: Policy, noise: Noise) -> bool:
-    """Whether a policy acts without noise."""
-    return policy.deterministic_by_default if noise == "default" else noise == "without"
+def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Results as JSON values."""
+    return [
+        {"policy": result.name, "action": f"{result.resolution}x{result.resolution}", **numbers(result)}
+        for result in results
+    ]
+
+
+def numbers(result: Result) -> dict[str, Any]:
+    """Numbers of a result as JSON values."""
+    return {
+        "episodes": len(result.returns),
+        "mean": round(result.mean, 3),
+        "std": round(result.std, 3),
+        "interval": None if result.interval is None else round(result.interval, 3),
+        "returns": [round(value, 3) for value in result.returns],
+        "success": result.success,
+    }
+
+
+def format_table(config: RunConfig, results: Sequence[Result]) -> str:
+    """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
+    counts = {len(result.returns) for result in results}
+    title = f"{config.task}, return over {' or '.join(map(str, sorted(counts)))} episodes"
+    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
+    for result in results:
+        grid = f"{result.resolution}x{result.resolution}"
+        interval = "–" if result.interval is None else f"{result.interval:.1f}"
+        spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
+        spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
+        success = "" if result.success is None else f"   success {result.success:.0%}"
+        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}")
+    return "\n".join(lines)

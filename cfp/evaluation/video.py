@@ -12,9 +12,8 @@ from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
-from cfp.evaluation.episodes import SeededPolicy, attached
-from cfp.evaluation.returns import Noise, evaluation_seed, without_noise
-from cfp.policy_protocols import Policy
+from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_seed, without_noise
+from cfp.policy import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
 from dittogym.render.recording import OPTIONS, Act, Recording, check_options, record

@@ -11,16 +11,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from cfp.config import RunConfig
-from cfp.evaluation.episodes import EpisodesStopped
-from cfp.evaluation.returns import evaluate, make_trial
+from cfp.evaluation.returns import EpisodesStopped, evaluate, make_trial
 from cfp.evaluation.video import record_episode
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.learner import Learner
+from cfp.policy import describe_run
 from cfp.tables import CSVTable
-from cfp.weights import describe_run
 from dittogym.render.recording import record
 
 #: Scalars that every algorithm logs beside its own.

@@ -15,7 +15,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from cfp.config import RunConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.files import read_json
-from cfp.weights import read_policy
+from cfp.policy import read_policy
 
 
 def parse_folder(words: list[str]) -> Path:

@@ -16,10 +16,8 @@ from stable_baselines3.common.logger import Logger
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.page import write_page
-from cfp.evaluation.plots import plot_curve
-from cfp.evaluation.results import format_table, to_rows
-from cfp.evaluation.returns import compare
+from cfp.evaluation.page import plot_curve, write_page
+from cfp.evaluation.returns import compare, format_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
     CheckpointCallback,
@@ -36,9 +34,9 @@ from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import read_json, write_atomically, write_json
 from cfp.learner import Learner
+from cfp.policy import copy_policy, is_of_another_task, read_policy
 from cfp.presets import like_start
 from cfp.tables import CSVTable
-from cfp.weights import copy_policy, is_of_another_task, read_policy
 from dittogym.render.frame import png
 
 

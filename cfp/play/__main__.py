@@ -15,7 +15,7 @@ import tyro
 
 from cfp.errors import ConfigError
 from cfp.experiment.cli import read_command, run_command
-from cfp.weights import load, read_policy, shipped
+from cfp.policy import load, read_policy, shipped
 from dittogym.tasks import check_task
 
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.

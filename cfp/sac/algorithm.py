@@ -24,16 +24,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from cfp.agent.actor import Actor
-from cfp.agent.composition import Composition
-from cfp.agent.lean import NetworkInput
-from cfp.agent.networks import TwinCritic, upsample
+from cfp.agent.actor import Actor, NetworkInput, upsample
+from cfp.agent.critics import TwinCritic
 from cfp.config import Hyperparameters
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import NonFiniteError
 from cfp.sac.exploration import CellNoise
 from cfp.sac.policies import CFPPolicy, NetworkPolicy
-from cfp.sac.replay import ReplayRing
+from cfp.sac.replay import Composition, ReplayRing
 
 #: Scalars that ``CFP.train`` logs.
 METRICS: dict[str, str] = {

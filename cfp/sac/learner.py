@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.config import Hyperparameters, Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
-from cfp.evaluation.pictures import policy_pictures
+from cfp.evaluation.page import policy_pictures
 from cfp.learner import CoarseToFine, Learner, refines
 from cfp.presets import sac_preset
 from cfp.sac.algorithm import CFP
@@ -53,7 +53,7 @@ class SACLearner(CFP, Learner):
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage before actor updates (a lean encoder learns earlier)."""
+        """Environment steps at the beginning of the stage before actor updates (the small encoder learns earlier)."""
         return max(self.hyperparameters.actor_start, self.hyperparameters.update_start)
 
     @classmethod

@@ -12,11 +12,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
 from torch import Tensor, nn
 
-from cfp.agent.actor import Actor, SquashedActor, build_actor
-from cfp.agent.actor_policy import check_images
-from cfp.agent.lean import Encoded, LeanCritics, NetworkInput, halved
-from cfp.agent.networks import TwinCritic, normalise_image
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import Actor, ActorSpec, Encoded, NetworkInput, SquashedActor, build_actor, halved, normalise_image
+from cfp.agent.critics import SmallCritics, TwinCritic
+from cfp.policy import check_images
 
 
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
@@ -112,19 +110,19 @@ class CFPPolicy(NetworkPolicy):
         """Create the actor with those of all coarser stages."""
         return build_actor(self.spec)
 
-    def new_critic(self) -> TwinCritic | LeanCritics:
+    def new_critic(self) -> TwinCritic | SmallCritics:
         """Create critics of actions as the actor's ``sample_for_critic`` composes them."""
         spec = self.spec
-        if spec.encoder == "lean":
-            return LeanCritics(spec.critic_size)
+        if spec.encoder == "small":
+            return SmallCritics(spec.critic_size)
         return TwinCritic(spec.action_size, spec.split, spec.interpolation)
 
     def shared_encoder(self) -> nn.Module | None:
-        """The lean encoder, which actor and critics share."""
-        return cast(Actor, self.actor).encoder if self.spec.encoder == "lean" else None
+        """The small encoder, which actor and critics share."""
+        return cast(Actor, self.actor).encoder if self.spec.encoder == "small" else None
 
     def encode(self, observations: Tensor) -> NetworkInput:
-        """What actor and critics take for ``observations`` (B, 3, 64, 64): with a lean encoder its features too."""
+        """What actor and critics take for ``observations`` (B, 3, 64, 64): with the small networks its features too."""
         encoder = self.shared_encoder()
         if encoder is None:
             return super().encode(observations)

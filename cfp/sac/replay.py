@@ -1,16 +1,66 @@
-"""The replay buffer."""
+"""The replay buffer, and the compact form in which it keeps composed actions."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import Tensor
 
-from cfp.agent.composition import Composition
+from cfp.agent.actor import ActorSpec, Interpolation, compose
+
+
+@dataclass(frozen=True)
+class Composition:
+    """Structure of a vector that holds the parts of a composed action, see `cfp.agent.actor.compose`."""
+
+    resolutions: tuple[int, ...]  # Action grid R of each stage, coarsest first
+    size: int  # Rows and columns of the composed action as critics take it
+    interpolation: Interpolation
+
+    @classmethod
+    def of(cls, spec: ActorSpec) -> Composition | None:
+        """Composition of an actor; None if critics take the executed action, and it is no larger than its parts."""
+        if spec.patch is None:
+            return None
+        composition = cls(spec.resolutions, spec.critic_size, spec.interpolation)
+        smaller = composition.length < 2 * spec.action_size**2
+        return composition if smaller or spec.critic_size < spec.action_size else None
+
+    @property
+    def grids(self) -> tuple[int, ...]:
+        """Action grid R of each part."""
+        return (self.resolutions[0], *(grid for grid in self.resolutions[1:] for _ in range(2)))
+
+    @property
+    def length(self) -> int:
+        """Number of entries of a vector."""
+        return sum(2 * grid**2 for grid in self.grids)
+
+    def join(self, parts: Sequence[Tensor]) -> Tensor:
+        """Concatenate parts (B, 2, R, R) to vectors (B, length)."""
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+    def split(self, vectors: Tensor) -> list[Tensor]:
+        """Undo `join`."""
+        pieces = vectors.split([2 * grid**2 for grid in self.grids], dim=1)
+        return [piece.unflatten(1, (2, grid, grid)) for piece, grid in zip(pieces, self.grids, strict=True)]
+
+    def from_finest(self, action: Tensor) -> Tensor:
+        """Vectors (B, length) for actions (B, 2, R, R) of the last stage with fully open gates."""
+        coarser = action.new_zeros(len(action), self.length - 2 * action[0].numel())
+        return self.join([coarser, action, torch.ones_like(action)])
+
+    def rebuild(self, vectors: Tensor) -> Tensor:
+        """Compose actions (B, 2, size, size) from vectors (B, length) as the actor does, up to rounding."""
+        return compose(self.split(vectors), self.size, self.interpolation)
 
 
 class ReplayRing(ReplayBuffer):

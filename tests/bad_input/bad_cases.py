@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cfp import train
-from cfp.files import write_policy
-from cfp.weights import SHIPPED, read_policy
+from cfp.policy import SHIPPED, read_policy, write_policy
 
 TINY = (
     "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 "

@@ -82,7 +82,7 @@ def first(change):
     return weights
 
 
-SHIPPED = (cfp.weights.SHIPPED / "run.safetensors").read_bytes()
+SHIPPED = (cfp.policy.SHIPPED / "run.safetensors").read_bytes()
 HUGE = {"x": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}
 
 POLICIES = [
@@ -129,9 +129,7 @@ POLICIES = [
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
     policy("with a tensor of terabytes", "damaged", content=header(HUGE)),
     policy("without a description", "must have a cfp-policy description", content=header({})),
-    policy(
-        "with a deep description", "nested too deeply", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})
-    ),
+    policy("with a deep description", "damaged", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})),
     policy("of another version", "description of version 1", changes={"version": 2}),
     policy("of another kind", "kind must be 'cfp', got 'mpc'", changes={"kind": "mpc"}),
     policy("of a task by number", "task must be a string, got 3", changes={"task": 3}),

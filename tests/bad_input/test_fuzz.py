@@ -16,7 +16,7 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
-from cfp.files import write_policy
+from cfp.policy import write_policy
 from cfp.presets import sac_preset
 from dittogym.tasks.targets import load_target
 

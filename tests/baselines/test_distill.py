@@ -1,5 +1,6 @@
 """Distillation into the image networks, on robots of a few hundred particles."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,10 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
+from baselines.compare.final_evaluation import Protocol
+from baselines.compare.jobs import Job
+from baselines.compare.results import read_result
+from baselines.compare.worker import train
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
@@ -19,10 +24,10 @@ from baselines.modular.nodes import Nodes
 from baselines.registry import configure
 from cfp.analytic.episodes import Episodes
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.files import write_policy
+from cfp.experiment.process import StopSignals
+from cfp.policy import describe_run, read_policy, write_policy
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
-from cfp.weights import describe_run, read_policy
 from dittogym import TorchEnv
 from dittogym.action import patch_field, to_grid_layout
 
@@ -321,6 +326,13 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()
     assert (folder / "teacher.safetensors").read_bytes() == trained
     capsys.readouterr()
+    config = configure(json.loads((folder / "config.json").read_text()))
+    job = Job("distill", config, tmp_path / "timed", Protocol(1))
+    with StopSignals() as signals:
+        train(job, signals, False)
+    cost = read_result(job).cost
+    assert (cost.steps, cost.last_step, cost.teacher_steps) == (32, 32, 32)
+    assert cost.teacher_seconds > 0 and cost.seconds > 0.01
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from cfp.config import EVALUATION_SEED, LARGEST_SEED
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import REFERENCE_RETURNS
 from cfp.files import read_json, write_json
+from cfp.policy import SHIPPED, shipped
 from cfp.presets import preset
-from cfp.weights import SHIPPED, shipped
 
 COMMITTED = Path(__file__).resolve().parents[2] / "docs" / "leaderboard"
 RETURNS, SUCCESSES = [float(value) for value in range(100, 108)], [True, True, *[False] * 6]

@@ -18,9 +18,9 @@ from baselines.registry import configure, find
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
+from cfp.policy import describe_run
 from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
-from cfp.weights import describe_run
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, to_grid_layout
 

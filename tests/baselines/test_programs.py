@@ -19,7 +19,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.returns import evaluate as play
 from cfp.experiment.callbacks import EvaluationCallback
 from cfp.experiment.training import parse
-from cfp.policy_protocols import SeesState
+from cfp.policy import StatePolicy
 from cfp.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("short")
@@ -143,7 +143,7 @@ def test_policy_is_loaded_by_its_kind(finished):
     algo, folder = finished
     images = np.zeros((3, 3, 64, 64), np.uint8)
     policy = baselines.load(folder)
-    if isinstance(policy, SeesState):
+    if isinstance(policy, StatePolicy):
         env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
         env.reset(seed=0)
         policy = policy.attached(env)
@@ -217,7 +217,7 @@ def test_algorithm_is_asked_for_its_scalars_when_a_row_is_written(tmp_path, monk
 def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at, step):
     """Also if the run is stopped in that evaluation, and continues when the policy is no longer there."""
     config = baselines.registry.configure(
-        {"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}, "network": {"encoder": "full"}}
+        {"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}, "network": {"encoder": "paper"}}
     )
     start = tmp_path / "start.safetensors"
     save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)

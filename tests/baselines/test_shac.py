@@ -13,18 +13,16 @@ from baselines import Shac, StatePolicy
 from baselines.registry import configure
 from baselines.shac import train as shac_train
 from baselines.shac.train import METRICS
-from cfp.agent.actor import build_actor
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.analytic import window as analytic_window
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.episodes import attached
-from cfp.evaluation.returns import evaluate, make_trial
+from cfp.evaluation.returns import attached, evaluate, make_trial
 from cfp.evaluation.video import record_policy
+from cfp.policy import describe_run
 from cfp.sections import EnvironmentConfig
-from cfp.weights import describe_run
 from dittogym import TorchEnv
 
 
@@ -282,7 +280,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
     actor, path = build_actor(ActorSpec((config.resolution(1),))), tmp_path / "policy.safetensors"
-    trained = configure({"algo": "coarse", "task": "run", "network": {"encoder": "full"}})
+    trained = configure({"algo": "coarse", "task": "run", "network": {"encoder": "paper"}})
     origins = replace(trained, environment=config.environment, resolutions=(config.resolution(1),))
     save_actor(path, actor, origins, 1, 5)
     warm = replace(config, start_from=str(path))

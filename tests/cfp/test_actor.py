@@ -5,9 +5,7 @@ import torch
 from torch import distributions
 from torch.nn import functional as F
 
-from cfp.agent.actor import Sample, build_actor
-from cfp.agent.networks import normalise_image, upsample
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import ActorSpec, Sample, build_actor, normalise_image, upsample
 from cfp.envs.make import make_torch_env
 from cfp.presets import sac_preset
 from dittogym import TASKS, make_spec

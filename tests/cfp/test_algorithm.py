@@ -11,10 +11,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
 
+from cfp.agent.actor import ActorSpec
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP, METRICS
-from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError, NonFiniteError
 

@@ -8,8 +8,7 @@ import torch
 
 import cfp
 import dittogym
-from cfp.agent.actor import build_actor
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.analytic.action_step import ActionStep
 from cfp.analytic.config import WindowConfig
 from cfp.analytic.learner import METRICS, AnalyticLearner
@@ -18,8 +17,8 @@ from cfp.analytic.reward import RewardConfig
 from cfp.analytic.window import WindowCollector, reward_warnings
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.folder import policy_path
+from cfp.policy import describe_run
 from cfp.sections import EnvironmentConfig
-from cfp.weights import describe_run
 from dittogym.rewards import Reward
 
 

@@ -1,4 +1,4 @@
-"""Evaluations: the same digits however episodes are spread over threads, and baselines that are played once."""
+"""Evaluations: the same digits however episodes are spread over threads, and what may be chosen for them."""
 
 import threading
 from dataclasses import replace
@@ -11,9 +11,7 @@ from fakes import FakeEnv
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
-from cfp.evaluation.episodes import Trial
-from cfp.evaluation.returns import evaluate, make_trial, untrained
-from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
 from cfp.train import PROGRAM
 from dittogym import TorchEnv
@@ -130,19 +128,6 @@ def test_an_episode_that_fails_ends_the_others():
     finally:
         torch.set_num_threads(threads)
     assert threading.active_count() == before and policies[0].steps < 10**6
-
-
-def test_reference_policies_are_played_only_where_their_returns_are_not_committed(short, monkeypatch):
-    played = []
-    monkeypatch.setattr("cfp.evaluation.returns.play", lambda trials, *_: played.extend(trials) or [[], []])
-    config = preset("run", "quick")
-    committed = untrained(config, 3)  # eight layouts at most
-    assert [result.name for result in committed] == ["zero action", "random action"] and not played
-    assert [len(result.returns) for result in committed] == [3, 3] and committed[0].mean > committed[1].mean > 0
-    for environment in ({"particles": 300}, {"substeps": 3}, {"dtype": "float64"}, {"resample": True}):
-        untrained(replace(config, environment=replace(config.environment, **environment)), 2)
-        assert len(played) == 2
-        played.clear()
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():

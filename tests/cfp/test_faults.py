@@ -12,8 +12,7 @@ from tiny_runs import assert_same_run, at_step, run
 import cfp
 from cfp import evaluate
 from cfp.experiment.callbacks import StopCallback
-from cfp.files import write_policy
-from cfp.weights import read_policy
+from cfp.policy import read_policy, write_policy
 
 pytestmark = pytest.mark.usefixtures("short")
 

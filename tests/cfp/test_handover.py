@@ -79,7 +79,7 @@ def test_second_stage_starts_from_a_policy(coarse, tmp_path, name):
 
 
 def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
-    for encoder in ("lean", "full"):
+    for encoder in ("small", "paper"):
         config = sac_preset("run")
         config = replace(config, network=replace(config.network, encoder=encoder))
         coarse, actor = (build_actor(config.actor_spec(stage)) for stage in (1, 2))
@@ -89,7 +89,7 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         before, after = coarse.encoder.state_dict(), actor.encoder.state_dict()
         assert all(torch.equal(value, actor.coarse.encoder.state_dict()[key]) for key, value in before.items())
         same = before.keys() == after.keys() and all(torch.equal(value, after[key]) for key, value in before.items())
-        assert same == (encoder == "lean")
+        assert same == (encoder == "small")
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         (["--task", "run"], "start_from must be a policy for run, got one for shapematch"),
         (["--refine", "--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
         (["--start-from", "no/such"], "there is no policy"),
-        (["--encoder", "full"], "start_from must be a policy with encoder full, got lean"),
+        (["--encoder", "paper"], "start_from must be a policy with encoder paper, got small"),
         (["--target", "T"], "start_from must be a policy for the target T, got the default"),
     ],
 )

@@ -10,19 +10,17 @@ from policy_files import save_actor
 from test_algorithm import make_batch, make_model
 from torch.nn import functional as F
 
-from cfp.agent.actor import build_actor
+from cfp.agent.actor import ActorSpec, Encoded, build_actor, halved, normalise_image, upsample
+from cfp.agent.critics import SmallCritics
 from cfp.agent.exploration import LONGEST, CellNoise
-from cfp.agent.lean import Encoded, LeanCritics, halved
 from cfp.agent.losses import critic_target
-from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.replay import ReplayRing
-from cfp.agent.spec import ActorSpec
 from cfp.config import to_json
 from cfp.errors import ConfigError
+from cfp.policy import load
 from cfp.presets import analytic_preset, from_json, sac_preset
-from cfp.weights import load
 
-LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
+LEAN = {"plain": ActorSpec((8,), encoder="small"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="small")}
 
 
 def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
@@ -160,20 +158,20 @@ def test_halved_images_are_means_of_four_pixels():
 def test_lean_policy_is_saved_and_loaded(tmp_path):
     config = sac_preset("run", "quick")
     spec = config.actor_spec(2)
-    assert spec.encoder == "lean"
+    assert spec.encoder == "small"
     actor, images = build_actor(spec), make_batch(8).observations
     save_actor(tmp_path / "policy.safetensors", actor, config, 2, 5)
     loaded = load(tmp_path)
     assert loaded.spec == spec
     assert torch.equal(loaded(images, deterministic=True), actor(images, deterministic=True))
-    full = build_actor(replace(spec, encoder="full"))
+    full = build_actor(replace(spec, encoder="paper"))
     count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, full)]
     assert count[0] < 0.8 * count[1]
 
 
 @pytest.mark.parametrize("patch", [18, 32])
 def test_lean_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
-    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="small")
     actor, images = build_actor(spec), make_batch(8).observations
     executed, learned = (sample(images, deterministic=True) for sample in (actor.sample, actor.sample_for_critic))
     assert (executed.action.shape[2:], learned.action.shape[2:]) == ((patch, patch), (8, 8))
@@ -181,13 +179,13 @@ def test_lean_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
         torch.testing.assert_close(one, other)
     coarse, residual, gate = learned.parts
     torch.testing.assert_close(learned.action, gate * residual + (1 - gate) * upsample(coarse, 8, "half_pixel"))
-    full = build_actor(replace(spec, encoder="full"))
+    full = build_actor(replace(spec, encoder="paper"))
     assert full.sample_for_critic(images).action.shape[2:] == (patch, patch)
 
 
 @pytest.mark.parametrize("patch", [8, 18])
 def test_batches_hold_actions_as_the_critics_take_them(patch):
-    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="small")
     model = make_model(spec, FakeEnv(num_envs=2, resolution=patch), update_start=4, batch_size=4)
     model.learn(24)
     batch = model.replay_buffer.sample(4)
@@ -200,7 +198,7 @@ def test_batches_hold_actions_as_the_critics_take_them(patch):
 
 
 def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
-    critics, on_grid = LeanCritics(8), torch.randn(3, 2, 8, 8)
+    critics, on_grid = SmallCritics(8), torch.randn(3, 2, 8, 8)
     encoded = critics.actions(on_grid)
     torch.testing.assert_close(critics.actions(F.interpolate(on_grid, size=64)), encoded)
     observation = Encoded(torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4))
@@ -208,7 +206,7 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
 
 
 def test_layers_of_lean_critics_bound_the_values_of_inputs_never_seen():
-    critics, image, features = LeanCritics(8), torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4)
+    critics, image, features = SmallCritics(8), torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4)
     actions = torch.randn(3, 2, 8, 8)
     large, larger = (critics(Encoded(image, scale * features), scale * actions) for scale in (1e3, 1e4))
     for one, other in zip(large, larger, strict=True):
@@ -250,14 +248,14 @@ def test_options_out_of_range_are_refused():
 
 def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_without_noise_of_cells():
     quick, started = sac_preset("run"), from_json({"task": "run", "learner": "sac", "start_from": "run"})
-    assert (quick.network.encoder, started.network.encoder) == ("lean", "full")
+    assert (quick.network.encoder, started.network.encoder) == ("small", "paper")
     assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
     usual = {"n_steps": 1, "weight_average": 0.0}
     assert started.learning == replace(quick.learning, batch_size=64, noise_cells=0, **usual)
     assert (quick.max_episode_steps, started.max_episode_steps) == (200, None)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
-    assert from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"encoder": "full"}}) == started
+    assert from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"encoder": "paper"}}) == started
     gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})
     assert gated == replace(started, network=replace(started.network, gate_scale=0.5))
     complete = to_json(started) | {"start_from": "moved-away"}  # as a run's config.json holds it

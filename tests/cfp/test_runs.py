@@ -10,7 +10,7 @@ from tiny_runs import assert_same_run, at_step
 
 import cfp
 from cfp import evaluate
-from cfp.weights import read_policy
+from cfp.policy import read_policy
 from dittogym.trajectories import load_episodes
 
 pytestmark = pytest.mark.usefixtures("short")

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from cfp import ImageFeatures
-from cfp.agent.networks import normalise_image
+from cfp.agent.actor import normalise_image
 from cfp.envs.vec_env import monitored
 from dittogym import TorchEnv
 

@@ -13,10 +13,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny_runs import assert_same_run, run
 
 from cfp import train
-from cfp.agent.actor import build_actor
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.agent.sac import METRICS
-from cfp.agent.spec import ActorSpec
-from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
+from cfp.evaluation.page import PICTURES, muscles, policy_pictures
 from cfp.experiment.callbacks import EVALUATION_COLUMNS, LOG_METRICS
 from cfp.experiment.loggers import EVALUATION_METRICS
 from cfp.experiment.sac_learner import ROLLOUT_METRICS

@@ -19,18 +19,16 @@ import cfp.experiment.run
 import dittogym
 import torchmpm
 from cfp import evaluate, train
-from cfp.agent.actor import build_actor
-from cfp.agent.actor_policy import ActorPolicy
-from cfp.agent.spec import ActorSpec
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.config import to_json
 from cfp.evaluation.returns import compare
 from cfp.experiment import callbacks
 from cfp.experiment.cli import program_name
 from cfp.experiment.training import parse
+from cfp.policy import ActorPolicy, policy_file, read_policy, shipped
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
-from cfp.weights import policy_file, read_policy, shipped
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 

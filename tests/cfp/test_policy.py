@@ -2,24 +2,27 @@ import json
 import subprocess
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import safetensors
 import torch
 from PIL import Image, ImageDraw
-from policy_files import save_actor
+from policy_files import describe_actor, save_actor
 
 import cfp
-from cfp.agent.actor import build_actor
-from cfp.agent.actor_policy import image_policy
-from cfp.agent.networks import normalise_image
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.agent.policies import CFPPolicy
-from cfp.agent.spec import ActorSpec
 from cfp.errors import CheckpointError, ConfigError
+from cfp.policy import check_trained_for, describe_run, is_of_another_task, policy_file, write_policy
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from cfp.weights import check_trained_for, describe_run, is_of_another_task, policy_file
+from dittogym.action import trained_layout
+
+
+def images(count=3):
+    return np.random.default_rng(0).integers(0, 256, (count, 3, 64, 64)).astype(np.uint8)
 
 
 @pytest.fixture
@@ -30,46 +33,74 @@ def saved(tmp_path):
     return tmp_path, actor
 
 
-@pytest.mark.parametrize("name", ["", "policy.safetensors", "policy.json"])
-def test_loaded_policy_acts_as_the_saved_one(saved, name):
+@pytest.mark.parametrize("name", ["", "policy", "policy.safetensors", "policy.json"])
+def test_loaded_policy_acts_bit_for_bit_as_the_one_in_training(saved, name):
     folder, actor = saved
     policy = cfp.load(folder / name)
-    images = np.random.default_rng(0).integers(0, 256, (3, 3, 64, 64)).astype(np.uint8)
-    actions, state = policy.predict(images, deterministic=True)
-    expected = actor(normalise_image(torch.from_numpy(images)), deterministic=True).detach().numpy()
-    np.testing.assert_allclose(actions, expected, atol=1e-6)
-    assert actions.shape == (3, 2, 64, 64) and policy.resolution == 64  # blended on the patch
-    assert state is None
-    single, _ = policy.predict(images[1], deterministic=True)
-    np.testing.assert_allclose(single, actions[1], atol=1e-5)
-    assert np.abs(policy.predict(images)[0] - actions).max() > 0.1
+    trained = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
+    trained.actor.load_state_dict(actor.state_dict())
+    assert policy.resolution == 64  # blended on the patch
+    for observation in (images(), images()[0]):
+        for deterministic in (True, False):
+            actions = []
+            for each in (policy, trained):
+                torch.manual_seed(0)
+                actions.append(each.predict(observation, deterministic=deterministic)[0])
+            np.testing.assert_array_equal(*actions)
+            assert actions[0].shape == (*observation.shape[:-3], 2, 64, 64)
 
 
 @pytest.mark.parametrize(
     ("image", "given"),
     [
-        (np.zeros((3, 64, 64), np.float32), r"float32 array of shape \(3, 64, 64\)"),  # such as a soft observation
-        (np.zeros((64, 64, 3), np.uint8), r"uint8 array of shape \(64, 64, 3\)"),
+        (np.zeros((3, 64, 64), np.float32), "float32 array"),  # such as a soft observation
+        (np.zeros((64, 64, 3), np.uint8), "uint8 array"),
         (torch.zeros(3, 64, 64, dtype=torch.uint8), "Tensor"),
     ],
 )
-def test_what_is_no_image_is_refused(saved, image, given):
-    policy = cfp.load(saved[0])
-    whole = CFPPolicy(
-        policy.observation_space, policy.action_space, lambda _: 1e-3, ActorSpec((8, 16), (-1.0,), patch=64)
-    )
+def test_what_is_no_image_is_refused(image, given):
+    policy = cfp.load("run")
+    whole = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
     for each in (policy, whole):
-        with pytest.raises(ValueError, match=f"observation must be a uint8 array of shape .*, got {given}"):
+        with pytest.raises(ValueError, match=f"observation must be a uint8 array .*, got {given}"):
             each.predict(image)
 
 
 def test_description_stands_beside_and_inside_the_weights(saved):
     folder, _ = saved
     beside = json.loads((folder / "policy.json").read_text())
-    assert beside == json.loads(json.dumps(cfp.load(folder).description))
+    with safetensors.safe_open(folder / "policy.safetensors", "pt") as file:
+        assert beside == json.loads(file.metadata()["cfp-policy"])
     assert (beside["task"], beside["resolution"], beside["stage"], beside["steps"]) == ("shapematch", 16, 2, 123)
     (folder / "policy.json").unlink()
     assert cfp.load(folder).description["steps"] == 123
+
+
+@pytest.mark.parametrize(("word", "encoder"), [("full", "paper"), ("lean", "small")])
+def test_words_of_the_file_format_stay(tmp_path, word, encoder):
+    spec = ActorSpec((4, 8), (0.0,), patch=64, encoder=encoder)
+    actor, description = build_actor(spec), describe_actor(sac_preset("run"), 1, 0) | {"network": asdict(spec)}
+    write_policy(tmp_path / "policy.safetensors", actor.state_dict(), description)
+    assert json.loads((tmp_path / "policy.json").read_text())["network"]["encoder"] == word
+    loaded = cfp.load(tmp_path)
+    assert loaded.spec == spec and loaded.description["network"]["encoder"] == encoder
+    torch.testing.assert_close(*(each(torch.from_numpy(images()), True) for each in (loaded, actor)), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("environment", "layout"),
+    [
+        ({"parity": "clean"}, "image"),
+        ({"parity": "reference"}, "grid"),
+        ({"parity": "reference", "action_layout": "image"}, "image"),
+    ],
+)
+def test_policies_with_parity_in_their_header_load(tmp_path, environment, layout):
+    actor, description = build_actor(ActorSpec((8,))), describe_actor(sac_preset("run", "paper"), 1, 0)
+    description["environment"] |= {"action_layout": None, **environment}
+    write_policy(tmp_path / "policy.safetensors", actor.state_dict(), description)
+    policy = cfp.load(tmp_path)
+    assert "parity" not in policy.description["environment"] and trained_layout(policy) == layout
 
 
 @pytest.mark.parametrize(
@@ -84,8 +115,7 @@ def test_description_stands_beside_and_inside_the_weights(saved):
 def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
     for given, wanted in ((one, other), (other, one)):
         description = {"task": task, "environment": {option: given}}
-        message = f"must be a policy for the {option} {wanted or 'of the task'}, got {given or 'the default'}"
-        with nullcontext() if same else pytest.raises(ConfigError, match=message):
+        with nullcontext() if same else pytest.raises(ConfigError, match=f"start_from .*{option}"):
             check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
 
 
@@ -94,28 +124,9 @@ def test_the_duration_of_a_step_must_be_that_of_the_training():
         ({"substeps": 100}, {"dt": 2e-4}, True),
         ({"dt": 2e-4, "substeps": 50}, {}, True),
         ({"substeps": 50}, {}, False),
-        ({}, {"dt": 2e-4, "substeps": 100}, False),
     ):
-        with nullcontext() if fits else pytest.raises(ConfigError, match="must be a policy for environment steps of"):
+        with nullcontext() if fits else pytest.raises(ConfigError, match="teacher must be a policy for"):
             check_trained_for("teacher", {"task": "run", "environment": own}, "run", EnvironmentConfig(**here))
-
-
-def images(count=3):
-    return np.random.default_rng(0).integers(0, 256, (count, 3, 64, 64)).astype(np.uint8)
-
-
-def test_loaded_policy_acts_bit_for_bit_as_the_one_in_training(saved):
-    folder, actor = saved
-    policy = cfp.load(folder)
-    trained = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
-    trained.actor.load_state_dict(actor.state_dict())
-    for observation in (images(), images()[0]):
-        for deterministic in (True, False):
-            actions = []
-            for each in (policy, trained):
-                torch.manual_seed(0)
-                actions.append(each.predict(observation, deterministic=deterministic)[0])
-            np.testing.assert_array_equal(*actions)
 
 
 @pytest.mark.parametrize(
@@ -144,11 +155,11 @@ def test_a_folder_without_a_policy_hides_no_shipped_one(tmp_path, monkeypatch):
     assert cfp.load("run").description["task"] == "run"
 
 
-@pytest.mark.parametrize(("name", "expected"), [("p", "p"), ("p.json", "p"), ("p-1.2", "p-1.2")])
-def test_file_of_a_policy_may_be_named_without_its_suffix(tmp_path, name, expected):
+def test_file_of_a_policy_may_be_named_without_its_suffix(tmp_path):
     for stem in ("p", "p-1", "p-1.2"):
         (tmp_path / f"{stem}.safetensors").touch()
-    assert policy_file(tmp_path / name) == tmp_path / f"{expected}.safetensors"
+    for name, expected in (("p", "p"), ("p.json", "p"), ("p-1.2", "p-1.2")):
+        assert policy_file(tmp_path / name) == tmp_path / f"{expected}.safetensors"
     with pytest.raises(CheckpointError, match=r"p\.backup\.safetensors: there is no policy"):
         policy_file(tmp_path / "p.backup")
 
@@ -170,10 +181,10 @@ def test_a_changed_target_picture_is_another_task(tmp_path):
     assert is_of_another_task(description, config)
 
 
-def test_the_policy_of_an_actor_is_an_independent_copy_made_without_random_numbers():
+def test_the_policy_of_an_actor_is_a_copy_made_without_random_numbers():
     spec = ActorSpec((4, 8), (-1.0,))
     actor, state = build_actor(spec), torch.get_rng_state()
-    policy = image_policy(spec, actor, deterministic=True)
+    policy = cfp.ActorPolicy(spec, True, actor)
     assert torch.equal(torch.get_rng_state(), state) and policy.deterministic_by_default
     before = policy.predict(images(), deterministic=True)[0]
     with torch.no_grad():
@@ -184,5 +195,5 @@ def test_the_policy_of_an_actor_is_an_independent_copy_made_without_random_numbe
 def test_loading_a_policy_imports_neither_tensorboard_nor_tyro():
     program = "import sys, cfp; cfp.load('run'); print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    assert "cfp.agent.actor_policy" in modules
+    assert "cfp.policy" in modules
     assert not {"tensorboard", "torch.utils.tensorboard", "tyro", "stable_baselines3"} & set(modules)
