@@ -20,7 +20,6 @@ from cfp.evaluation.returns import Result, UntrainedPolicy, evaluate, evaluation
 from cfp.files import write_text
 from cfp.policy import Policy
 from cfp.tables import csv_text
-from cfp.train import PROGRAM
 
 COLUMNS = ("task", "particles", "policy", "action", "episodes", "mean", "lowest", "highest", "std", "success")
 KEY = ("task", "particles", "policy", "episodes")
@@ -32,7 +31,7 @@ def results(
     """Results and the particle counts for which they hold."""
     seed, size = evaluation_seed(config), config.resolution(1)
     for particles in ("full", "lite"):
-        there = replace(config, environment=config.environment.for_evaluation(particles))
+        there = replace(config, particles=particles)
         trials = [
             make_trial(there, kind, UntrainedPolicy(kind, size), untrained, deterministic=True, seed=seed)
             for kind in ("zero", "random")
@@ -84,9 +83,9 @@ def main() -> None:
     arguments = parser.parse_args()
     for given in arguments.policies:
         if (Path(given) / "config.json").exists():
-            config, policies = open_run(PROGRAM, Path(given), "cpu")
+            config, policies = open_run(Path(given), "cpu")
         else:
-            config, policies = open_policy(PROGRAM, given, "cpu", None)
+            config, policies = open_policy(given, "cpu", None)
         rows = []
         for particles, result in results(config, policies, arguments.episodes, arguments.untrained, arguments.success):
             rows.append(to_row(config.task, particles, result))

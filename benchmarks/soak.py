@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import dittogym  # noqa: F401  registers the environments
-from cfp.sections import Particles
+from cfp.config import Particles
 from cfp.tables import CSVTable
 from torchmpm import diagnostics
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from scipy.stats import binomtest
 
-from baselines.train import PROGRAM
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
@@ -28,8 +28,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--particles", choices=("full", "lite"), default="full")
     arguments = parser.parse_args()
-    config, policies = open_policy(PROGRAM, arguments.policy, "cpu", None)
-    config = replace(config, environment=config.environment.for_evaluation(arguments.particles))
+    config, policies = open_policy(arguments.policy, "cpu", None)
+    config = replace(config, particles=arguments.particles)
     policy = policies.popitem()[1]
     case = Case("noise", action_noise=arguments.noise)
 

@@ -22,7 +22,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
 from cfp import CFP, CFPPolicy, SACConfig
-from cfp.agent.hyperparameters import LearningConfig
 from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
 from cfp.presets import sac_preset
@@ -33,7 +32,7 @@ def make_model(config: SACConfig, stage: int, num_envs: int) -> CFP:
     hyperparameters = replace(
         config.hyperparameters(stage),
         buffer_size=2_000,
-        update_start=config.learning.batch_size,
+        update_start=config.batch_size,
         random_steps=0,
         actor_start=0,
     )
@@ -116,12 +115,10 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 def former_quick(task: str) -> SACConfig:
     """Options of the preset quick before its networks became small."""
-    learning = LearningConfig(
-        batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
-    )
-    quick, paper = sac_preset(task, "quick"), sac_preset(task, "paper")
-    network = replace(quick.network, encoder="paper")
-    return replace(quick, resolutions=paper.resolutions, network=network, learning=learning)
+    plain = {"final_rate": 1.0, "n_steps": 1, "weight_average": 0.0, "noise_cells": 0}
+    learning = {"batch_size": 64, "learning_rate": 1e-3, "gamma": 0.9, "tau": 0.01, "gradient_steps": 4}
+    resolutions = sac_preset(task, "paper").resolutions
+    return replace(sac_preset(task, "quick"), resolutions=resolutions, encoder="paper", **plain, **learning)
 
 
 def training(task: str, steps: int) -> None:
@@ -129,11 +126,11 @@ def training(task: str, steps: int) -> None:
     print(f"| {task}, preset | stage | training steps/s | simulation | updates | rest |")
     print("| --- " * 6 + "|")
     for name, config in (("former quick", former_quick(task)), ("quick", sac_preset(task, "quick"))):
-        num_envs = config.environment.num_envs
+        num_envs = config.num_envs
         for stage in (1, 2):
             model = make_model(config, stage, num_envs)
             clock: dict[str, float] = {}
-            model.learn(config.learning.batch_size + 2 * num_envs)
+            model.learn(config.batch_size + 2 * num_envs)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
                 model.learn(steps * num_envs, reset_num_timesteps=False)

@@ -378,7 +378,7 @@ class CFP(SAC):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
+        """Continue from the ``state`` of `state_dict`."""
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         self._episode_num, self._n_updates = state["episodes"], state["updates"]
