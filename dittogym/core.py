@@ -18,7 +18,6 @@ from dittogym.physics import NAMES, Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
-from torchmpm.rollout import Reads, changed, versions
 from torchmpm.tree import cached_tensors, transforming
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
@@ -79,9 +78,7 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     state = EnvState(particles, spec.window.origin(start.com), start.com, start, {}, physics or {}, steps)
     observation = observe(model, state)
     moment = _moment(model, state, start, observation, EXACT)
-    before = versions(moment._asdict())
     memory = spec.initial_memory(moment, spec)
-    _refuse_changes(f"initial_memory of task {spec.name!r}", before)
     check_memory(spec.name, memory, spec.stale_memory, len(positions))
     # Of any kind of mapping, and a copy: it may hold what the state does.
     return replace(state, memory=tree.map(Tensor.clone, dict(memory))), observation
@@ -229,9 +226,7 @@ def _weighted_reward(
 ) -> tuple[Outcome, dict[str, Tensor], Tensor]:
     """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
-    before = versions(moment._asdict())
     outcome = spec.reward_fn(moment, spec)
-    _refuse_changes(f"reward_fn of task {spec.name!r}", before)
     check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
@@ -249,12 +244,6 @@ def _weighted_reward(
     if not transforming() and not math.isfinite(reward.detach().sum()):
         _check_finite(spec.name, list(terms), values, valid)
     return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
-
-
-def _refuse_changes(who: str, before: Reads) -> None:
-    """Refuse changes in place of the moment whose versions were noted."""
-    if names := changed(before):
-        raise ValueError(f"{who} must not change its moment in place, but it changed {', '.join(names)}")
 
 
 @cached_tensors

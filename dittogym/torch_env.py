@@ -50,8 +50,8 @@ class TorchEnv:
             ``TaskSpec.stale_memory`` after a reset, and at every particle count its random positions, unit particle
             volume and pixel raster.
         resample: Draw new particles at every reset, not only at a seeded one.
-        deterministic: Refuse what does not repeat bit by bit: CUDA, and the backend ``"compile"``.
-        segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
+        deterministic: Refuse what does not repeat bit by bit: CUDA.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
@@ -100,9 +100,8 @@ class TorchEnv:
             checks.flag(name, flag)
         self.dtype = arguments.choice("dtype", str(dtype).removeprefix("torch."), arguments.DTYPES)
         self.device = arguments.find_device(device)
-        if deterministic and (self.device.type != "cpu" or backend == "compile"):
-            needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
-            raise ValueError(f"{needs}, got {device!r} and {backend!r}")
+        if deterministic and self.device.type != "cpu":
+            raise ValueError(f"deterministic=True needs device 'cpu', got {device!r}")
         self.action_resolution = arguments.find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._as_reference = arguments.choice("parity", parity, {"clean": False, "reference": True})

@@ -56,7 +56,7 @@ class GradLabConfig:
     dt: float = DT
     """Duration of a substep, s."""
     backend: str = "auto"
-    """How the physics is computed: auto, eager, compile, ..."""
+    """How the physics is computed: auto, eager or native"""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
     """Control steps over which rewards are summed; those beyond the end of the episode are left out."""
     warmup: int = 8

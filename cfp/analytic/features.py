@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dittogym import TorchEnv
 from dittogym.window import centre_in_window
-from torchmpm.spline import quadratic_weights
+from torchmpm.transfer import quadratic_weights
 
 #: Cells per axis of the rasters.
 CELLS = 16

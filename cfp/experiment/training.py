@@ -208,8 +208,6 @@ def train(program: Program, command: Command, hint: str) -> None:
             run = TrainingRun(program.find(config), config, folder, command.resume, signals)
             learner = f", learner {config.learner}" if isinstance(config, CoarseToFineConfig) else ""
             print(f"{config.algo} on {config.task}{learner}, preset {config.preset}, seed {config.seed} -> {folder}")
-            if config.environment.backend == "compile":
-                print("compiling the physics; the first time on a machine this takes half a minute ...")
             try:
                 run.train()
             except Stopped as stopped:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dittogym.geometry import Box
 from dittogym.observation.image import BLOCK, RASTER, SATURATION, SIZE
-from torchmpm.spline import quadratic_weights
+from torchmpm.transfer import quadratic_weights
 
 #: Pixels around the image that splats at its edge reach into.
 FRAME = 3

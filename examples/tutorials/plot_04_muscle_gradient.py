@@ -7,8 +7,7 @@ gradient of the robot's height with respect to its actions, and follows it to ma
 """
 
 # %%
-# The gradient goes through ten control steps, here with 50 substeps each. `torchmpm.estimate_memory` predicts the
-# memory that a gradient needs.
+# The gradient goes through ten control steps, here with 50 substeps each.
 
 import matplotlib.pyplot as plt
 import torch

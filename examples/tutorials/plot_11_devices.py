@@ -43,8 +43,7 @@ def throughput(num_envs: int, gradient: bool = False) -> float:
 
 # %%
 # A batch of robots can be divided among many cores; a single robot uses only a few. On a GPU, double the batch
-# size until the curve is flat or the memory is full. `torchmpm.estimate_memory` predicts the memory that gradients
-# need.
+# size until the curve is flat or the memory is full; measure one step with its gradient first.
 
 sizes = (1, 2, 4, 8, 16, 32)
 forward = [throughput(size) for size in sizes]

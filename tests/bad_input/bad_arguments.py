@@ -23,10 +23,8 @@ from torchmpm import (
     Solver,
     VelocityRule,
     diagnostics,
-    estimate_memory,
     lame,
     sampling,
-    segment_for,
 )
 
 ID = "dittogym/run-coarse-v0"
@@ -89,45 +87,6 @@ def table(rows, error=ValueError):
         for name, call, words in rows
     ]
 
-
-MEMORY = table(
-    [
-        (
-            "memory of two numbers",
-            lambda: estimate_memory(solver(), (1, 5), substeps=1),
-            "state must be a ParticleState",
-        ),
-        (
-            "memory of a dtype by name",
-            lambda: estimate_memory(solver(), (1, 5, "float32"), substeps=1),
-            "(B, N, torch.float32 or torch.float64), got (1, 5, 'float32')",
-        ),
-        (
-            "memory of no solver",
-            lambda: estimate_memory(None, state(), substeps=1),
-            "solver must be a Solver, got None",
-        ),
-    ],
-    TypeError,
-) + table(
-    [
-        (
-            "memory of minus five particles",
-            lambda: estimate_memory(solver(), (1, -5, torch.float32), substeps=1),
-            "N of the state must be at least 1, got -5",
-        ),
-        (
-            "segment for a budget as text",
-            lambda: segment_for(solver(), state(), substeps=2, budget="1 GB"),
-            "budget must be a whole number, got '1 GB'",
-        ),
-        (
-            "segment for half substeps",
-            lambda: segment_for(solver(), state(), substeps=2.5, budget=10**9),
-            "substeps must be a whole number, got 2.5",
-        ),
-    ]
-)
 
 SOLVER = table(
     [
@@ -373,4 +332,4 @@ ENVIRONMENT = table(
     TypeError,
 )
 
-CASES = [*MEMORY, *SOLVER, *ENVIRONMENT]
+CASES = [*SOLVER, *ENVIRONMENT]

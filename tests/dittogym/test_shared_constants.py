@@ -65,4 +65,4 @@ def test_a_broken_simulation_does_not_spoil_the_gradient_of_a_material(backend: 
     assert gradients[1] != 0
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=0)
     assert torch.equal(ends[0].x[1], ends[1].x[0])
-    assert not all(plane[0].isfinite().all() for plane in ends[0].planes())
+    assert not all(plane[0].isfinite().all() for plane in ends[0].components())

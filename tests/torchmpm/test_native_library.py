@@ -1,11 +1,14 @@
 """Compiling the kernels: once per machine, safely, and with clear words where it cannot be done."""
 
 import ctypes
+import gc
+import os
 import stat
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +17,7 @@ from scenes import lively, robot
 
 from torchmpm.backends import compiler_found
 from torchmpm.native.cpu import compiler, library
+from torchmpm.native.tables import tables_of
 
 
 @pytest.fixture(autouse=True)
@@ -177,6 +181,32 @@ def test_windows() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.stdout.startswith("[0.0, -0.0008999"), done.stderr
     assert done.stderr.endswith("backend 'native' does not run on Windows, except in WSL: use 'eager'\n"), done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_process_that_does_not_simulate_keeps_its_threads() -> None:
+    """One that does has a single thread, see ``tests/dittogym/test_concurrency.py``."""
+    program = (
+        "import os, torch, torchmpm\ntorch.set_num_threads(3)\nif not (child := os.fork()):\n"
+        "    before = torch.get_num_threads(); torchmpm.sampling.sobol(9, 0)\n"
+        "    os._exit(10 * before + torch.get_num_threads())\nprint(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "31\n", done.stderr
+
+
+def test_tables_live_as_long_as_their_solvers_and_graphs() -> None:
+    solver, state = robot(5, backend="native", dt=7e-5), lively(5)
+    handle, v = solver.kernels.tables.handle, state.v.clone().requires_grad_()
+    final = solver.step(replace(state, v=v))
+    del solver
+    gc.collect()
+    assert tables_of(handle).dt == 7e-5
+    final.x.sum().backward()
+    del final
+    gc.collect()
+    with pytest.raises(KeyError):
+        tables_of(handle)
 
 
 def test_the_sources_are_hashed_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -176,7 +176,8 @@ def momentum_balance(
     mass, before = diagnostics.mass(solver, state), diagnostics.momentum(solver, state)
     impulses = {name: torch.zeros_like(before) for name in ("gravity", "damping", "boundary")}
     for _ in range(substeps):
-        on_grid = particles_to_grid(solver.scene(state, actuation), state.planes()).momentum[0].sum(-1)
+        scene = solver.scene(state, actuation, torch.zeros(1, 2, dtype=torch.float64))
+        on_grid = particles_to_grid(scene, state.components()).momentum[0].sum(-1)
         torch.testing.assert_close(on_grid, mass, rtol=1e-12, atol=0)
         for name, impulse in diagnostics.impulses(solver, state, actuation).items():
             impulses[name] += impulse
@@ -302,7 +303,7 @@ def test_input_is_left_as_it_was() -> None:
 def test_precision_is_the_state_s(dtype: torch.dtype) -> None:
     state = lively(100).to(dtype)
     result = robot_and_ball(60, 40).step(state, field().to(dtype), substeps=20)
-    assert {t.dtype for t in result.planes()} == {dtype}
+    assert {t.dtype for t in result.components()} == {dtype}
     exact = robot_and_ball(60, 40).step(lively(100), field(), substeps=20)
     torch.testing.assert_close(result.x.double(), exact.x, rtol=0, atol=1e-6)
 

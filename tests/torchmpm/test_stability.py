@@ -14,7 +14,7 @@ from scenes import GRID, generator, normal, positions
 from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VonMises, lame
 from torchmpm.backends import compiler_found
 from torchmpm.materials.linalg import Mat2
-from torchmpm.materials.muscle import muscle_stress
+from torchmpm.substep import muscle_stress
 
 MU, LAM = 300.0, 200.0
 MATERIALS = {

@@ -75,7 +75,7 @@ def test_the_fields_at_rest_have_memory_of_their_own() -> None:
 
 def test_planes_are_the_components_and_invert() -> None:
     state = lively(7, 2)
-    planes = state.planes()
+    planes = state.components()
     expected = [state.x[..., 0], state.x[..., 1], state.v[..., 0], state.v[..., 1]]
     expected += [matrix[..., row, col] for matrix in (state.C, state.F) for row in (0, 1) for col in (0, 1)]
     expected.append(state.Jp)
@@ -83,7 +83,7 @@ def test_planes_are_the_components_and_invert() -> None:
     assert all(torch.equal(plane, component) for plane, component in zip(planes, expected, strict=True))
     again = ParticleState.from_stack(torch.stack(planes))
     assert_identical(again, state)
-    assert all(plane.is_contiguous() for plane in again.planes())
+    assert all(plane.is_contiguous() for plane in again.components())
 
 
 def test_integer_index_keeps_the_batch_dimension() -> None:

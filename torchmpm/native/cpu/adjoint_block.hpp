@@ -199,14 +199,14 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
     }
 }
 
-// Snow that moves faster than a substep resolves passes no derivative on, see torchmpm/materials/resolved.py.
+// Snow that moves faster than a substep resolves passes no derivative on, see Snow in torchmpm/materials/snow.py.
 PASS void drop_unresolved(Bounds bounds, const Block& state, Block& bar) {
     const Real limit = square(LARGEST_STRAIN * bounds.resolved_rate);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
         const bool drop = square(state.v[C0][k]) + square(state.v[C1][k]) + square(state.v[C2][k]) +
                               square(state.v[C3][k]) > limit;
-        for (int c = 0; c < PLANES; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
+        for (int c = 0; c < COMPONENTS; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
     }
 }
 

@@ -2,10 +2,10 @@
 #pragma once
 #include "scene.hpp"
 
-enum Plane : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, PLANES };
+enum Component : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, COMPONENTS };
 
 struct alignas(64) Block {
-    Real v[PLANES][LANES];
+    Real v[COMPONENTS][LANES];
 };
 
 // Inclusive range of nodes on the padded grid.
