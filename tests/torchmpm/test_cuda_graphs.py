@@ -69,11 +69,11 @@ class Adder(programs.Program):
 
     def __init__(self, inputs: Inputs) -> None:
         Adder.built += 1
-        self.inputs, self.sum = inputs, torch.empty_like(inputs.planes)
+        self.inputs, self.sum = inputs, torch.empty_like(inputs.components)
         self.results = (self.sum,)
 
     def run(self) -> None:
-        self.sum.copy_(self.inputs.planes + 1)
+        self.sum.copy_(self.inputs.components + 1)
 
 
 @pytest.fixture

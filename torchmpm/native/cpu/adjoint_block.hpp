@@ -165,8 +165,6 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
         const Real pxx = h * momentum.affine[0][k], pxy = h * momentum.affine[1][k];
         const Real pyx = h * momentum.affine[2][k], pyy = h * momentum.affine[3][k];
         const Real gx = momentum.act_bar[0][k], gy = momentum.act_bar[1][k];
-        const Real slope_x[3] = {fx - Real(1.5), 2 - 2 * fx, fx - Real(0.5)};
-        const Real slope_y[3] = {fy - Real(1.5), 2 - 2 * fy, fy - Real(0.5)};
         Real fx_bar = 0, fy_bar = 0, masses = 0;
         three([&](int p) {
             Real row = 0, row_slope = 0, row_x = 0, row_y = 0, row_mass = 0;
@@ -180,11 +178,11 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
                 const Real along_y = cxy * vx + cyy * vy + pxy * px + pyy * py;
                 value += (p - fx) * along_x + (q - fy) * along_y;
                 const Real w = at.wy[q][k];
-                row += w * value, row_slope += slope_y[q] * value;
+                row += w * value, row_slope += weight_slope(fy, q) * value;
                 row_x += w * along_x, row_y += w * along_y, row_mass += w * m;
             });
             const Real w = at.wx[p][k];
-            fx_bar += slope_x[p] * row - w * row_x;
+            fx_bar += weight_slope(fx, p) * row - w * row_x;
             fy_bar += w * (row_slope - row_y);
             masses += w * row_mass;
         });
