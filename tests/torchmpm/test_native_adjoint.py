@@ -225,7 +225,7 @@ def test_second_derivatives_are_refused() -> None:
     v = lively(10).v.clone().requires_grad_()
     final = robot(10, backend="native").step(replace(lively(10), v=v), substeps=2)
     (first,) = torch.autograd.grad(final.x.square().sum(), v, create_graph=True)
-    with pytest.raises(RuntimeError, match="backend 'native' has no second derivatives: use backend 'eager'"):
+    with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(first.sum(), v)
 
 

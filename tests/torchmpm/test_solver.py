@@ -387,5 +387,5 @@ def test_tensors_of_a_material_may_be_of_all_kinds(name: str, value: Tensor) -> 
 
 
 def test_numbers_of_a_material_and_of_bodies_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"^bodies\[0\].material.log_mass must be finite, got nan"):
+    with pytest.raises(ValueError, match=r"bodies\[0\].material.log_mass"):
         robot(5, bodies=(Body(5, Soft("log_mass", torch.tensor(math.nan)), mass=2.0),))

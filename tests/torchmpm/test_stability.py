@@ -86,7 +86,7 @@ def test_beyond_it_a_solver_is_refused_and_told_the_limit() -> None:
     named = float(re.search(r"at most (\S+) s", str(raised.value))[1])
     assert named == pytest.approx(limit, rel=1e-12)
     assert Solver(GRID, (body,), dt=named).stable_dt() == named
-    with pytest.raises(ValueError, match="allow_unstable=True accepts it"):
+    with pytest.raises(ValueError, match="allow_unstable"):
         Solver(GRID, (body,), dt=math.nextafter(named, 1.0))
     assert Solver(GRID, (body,), dt=0.1, allow_unstable=True).stable_dt() == named
 
