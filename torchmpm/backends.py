@@ -4,7 +4,6 @@ import functools
 import logging
 
 from torchmpm.native.cpu.compiler import find_compiler
-from torchmpm.native.cpu.library import NO_COMPILER, provenance
 
 BACKENDS = ("auto", "eager", "native")
 _logger = logging.getLogger(__name__)
@@ -13,11 +12,6 @@ _logger = logging.getLogger(__name__)
 def compiler_found() -> bool:
     """Whether there is a C++ compiler: $CXX, g++ or clang++."""
     return find_compiler() is not None
-
-
-def missing() -> str | None:
-    """The end of the message "backend 'native' ..." if it cannot run on this machine's CPU; ``None`` if it can."""
-    return None if provenance() else NO_COMPILER
 
 
 @functools.cache

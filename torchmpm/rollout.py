@@ -114,7 +114,7 @@ def _checkpointed(function: Callable[..., State], *arguments: Any) -> State:
 
     ``torch.utils.checkpoint`` differentiates in all tensors that the function reads, but notices only of the arguments
     when one of them is changed in place before the replay. After a change of others the replay comes to another
-    result, and this raises an error.
+    result, unless a factor is zero, and this raises an error.
     """
     tensors, rebuild = tree.flatten(tree.without_inference(arguments))
     result: State | None = None

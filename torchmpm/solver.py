@@ -11,12 +11,12 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
-from torchmpm.backends import BACKENDS, missing, warn_eager
+from torchmpm.backends import BACKENDS, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value, try_law
 from torchmpm.materials.body import Body, per_particle, slices
-from torchmpm.native.cpu.library import leave_parent_threads, load
+from torchmpm.native.cpu.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.kernels import Kernels
 from torchmpm.native.tables import KINDS
 from torchmpm.rollout import Segment, check_repetition, repeated
@@ -103,9 +103,8 @@ class Solver:
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
-        lack = missing() if self.backend == "native" and not torch.cuda.is_available() else None
-        if lack is not None:
-            raise ValueError(f"backend 'native' {lack}")
+        if self.backend == "native" and not torch.cuda.is_available() and not provenance():
+            raise ValueError(f"backend 'native' {NO_COMPILER}")
         for name, tensor in self.constants.items():
             if tensor.is_floating_point() and tensor.numel():  # a material may have tensors of all kinds
                 checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)

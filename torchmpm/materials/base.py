@@ -69,9 +69,7 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
     Raises:
         ValueError: A number is out of range, or one of a tensor.
     """
-    checks.value("young", young)
     checks.entries("young", young, least=0.0)
-    checks.value("poisson", poisson)
     checks.entries("poisson", poisson, above=-1.0, below=0.5)
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
@@ -114,5 +112,4 @@ def detached_column(value: Value) -> Value:
 def check_not_negative(material: object, *names: str) -> None:
     """Raise a ValueError if a constant of a material is negative or not a number."""
     for name in names:
-        checks.value(name, getattr(material, name), least=0.0)
         checks.entries(name, getattr(material, name), least=0.0)

@@ -106,7 +106,6 @@ class VonMises(Elastic):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.value("mu", self.mu, above=0.0)
         checks.entries("mu", self.mu, above=0.0)  # the strain at yield is a stress divided by it
         check_not_negative(self, "yield_stress")
 
