@@ -10,12 +10,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[ROWS] = []
 
 
-@pytest.fixture(autouse=True)
-def fresh_compiler() -> None:
-    """Each benchmark may compile anew: after too many compilations in a process, torch.compile runs eagerly."""
-    torch.compiler.reset()
-
-
 @pytest.fixture
 def per_substep(request: pytest.FixtureRequest, benchmark):
     """Time ``run``, which advances ``particles`` particles by ``substeps`` substeps, and record the cost of one."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 
 import dittogym
-from torchmpm import estimate_memory
 
 SIZES = (22000, 2000)
 REPEATS = 7
@@ -42,16 +41,15 @@ def measure(count: int) -> None:
     """Print a row of the table."""
     env = dittogym.TorchEnv("run", particles=count, backend="native")
     env.reset(seed=0)
-    substeps, solver = env.model.substeps, env.model.solver
+    substeps = env.model.substeps
     step(env, False)
     gc.collect()
     before = resident("VmRSS")
     step(env, True)
     used = resident("VmHWM") - before
     forward, both = (min(step(env, gradients) for _ in range(REPEATS)) for gradients in (False, True))
-    predicted = estimate_memory(solver, env.state, substeps=substeps)
     times = f"{1e3 * forward / substeps:.3f} | {1e3 * both / substeps:.3f} | {both / forward:.1f}"
-    print(f"| {count:,} | {times} | {predicted / 2**20:.0f} | {used / 2**20:.0f} |", flush=True)
+    print(f"| {count:,} | {times} | {used / 2**20:.0f} |", flush=True)
 
 
 def main() -> None:
@@ -62,8 +60,8 @@ def main() -> None:
     if particles:
         measure(particles)
         return
-    print("| particles | forward, ms a substep | with backward | ratio | MiB predicted | MiB measured |")
-    print("| --- | --- | --- | --- | --- | --- |", flush=True)
+    print("| particles | forward, ms a substep | with backward | ratio | MiB |")
+    print("| --- | --- | --- | --- | --- |", flush=True)
     for count in SIZES:
         subprocess.run([sys.executable, __file__, "--particles", str(count)], check=True)
 

@@ -19,7 +19,6 @@ from test_solver import scene
 
 from cfp.files import write_text
 from cfp.tables import csv_text
-from torchmpm.memory import estimate_memory
 
 SUBSTEPS = 100
 ROBOTS = {
@@ -49,7 +48,7 @@ class Options:
 
 
 def prepare(backend: str, batch: int, count: int) -> tuple[Row, dict[str, Callable[[], object]]]:
-    """The row of a case with its memory, and the two steps to measure."""
+    """The row of a case, and the two steps to measure."""
     solver, state, actuation, origin = scene(backend, batch, count)
     cotangent = torch.sin(40 * state.x)
 
@@ -60,11 +59,7 @@ def prepare(backend: str, batch: int, count: int) -> tuple[Row, dict[str, Callab
         leaf = actuation.clone().requires_grad_()
         torch.autograd.grad(forward(leaf), leaf, cotangent)
 
-    memory = estimate_memory(solver, state, substeps=SUBSTEPS) / 2**20
-    return {"robots": batch, "particles": count, "memory (MiB)": round(memory, 1)}, {
-        "forward": forward,
-        "gradient": gradient,
-    }
+    return {"robots": batch, "particles": count}, {"forward": forward, "gradient": gradient}
 
 
 def measure(options: Options) -> list[Row]:
@@ -92,20 +87,17 @@ def measure(options: Options) -> list[Row]:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Draw time and memory over the number of particles of all robots."""
+    """Draw time over the number of particles of all robots."""
     table = {(int(row["robots"]), int(row["particles"])): row for row in rows}
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    figure, axes = pyplot.subplots(figsize=(5, 3.6), layout="constrained")
     for (label, cases), colour in zip(ROBOTS.items(), ("tab:blue", "tab:orange"), strict=True):
         totals = [batch * count for batch, count in cases]
         for (name, words), line in zip(MEASURES.items(), ("o-", "s--"), strict=True):
             costs = [table[case][f"{name} (ns/particle)"] for case in cases]
-            left.loglog(totals, costs, line, color=colour, label=f"{label}, {words}")
-        right.loglog(totals, [table[case]["memory (MiB)"] for case in cases], "s--", color=colour, label=label)
-    left.set(xlabel="particles of all robots", ylabel="ns per particle and substep", ylim=(1, None))
-    right.set(xlabel="particles of all robots", ylabel="memory of a gradient (MiB)")
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+            axes.loglog(totals, costs, line, color=colour, label=f"{label}, {words}")
+    axes.set(xlabel="particles of all robots", ylabel="ns per particle and substep", ylim=(1, None))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
     figure.savefig(path, dpi=150)
 
 

@@ -18,7 +18,6 @@ import tyro
 import dittogym
 from cfp.files import write_text
 from cfp.tables import csv_text
-from torchmpm import estimate_memory
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,12 @@ def row(task: str, particles: str, options: Options) -> dict[str, object]:
         env.step(leaf, soft=True)[1].sum().backward()
         env.detach()
 
-    memory = estimate_memory(env.model.solver, env.state, substeps=env.model.substeps)
     return {
         "task": task,
         "particles": particles,
         "number": f"{env.num_particles:,}",
         "step, ms": f"{milliseconds(step, options):.1f}",
         "with gradient, ms": f"{milliseconds(gradient, options):.1f}",
-        "memory of the gradient, MiB": f"{memory / 2**20:.0f}",
     }
 
 

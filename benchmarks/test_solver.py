@@ -67,7 +67,7 @@ def scene(
     return solver, state.to(device), actuation.to(device), origin.to(device)
 
 
-@cases(eager="1x22000 1x2000 16x2000", compile="1x22000 1x2000 16x2000", native=" ".join(SIZES))
+@cases(eager="1x22000 1x2000 16x2000", native=" ".join(SIZES))
 def test_forward(per_substep, backend: str, batch: int, count: int, device: str) -> None:
     solver, state, actuation, origin = scene(backend, batch, count, device)
 
@@ -105,7 +105,7 @@ def test_materials(per_substep, bodies: str) -> None:
     per_substep(run, particles=count, substeps=100, rounds=8)
 
 
-@cases(eager="1x2000", compile="1x2000", native=" ".join(SIZES))
+@cases(eager="1x2000", native=" ".join(SIZES))
 def test_forward_backward(per_substep, backend: str, batch: int, count: int, device: str) -> None:
     solver, state, actuation, origin = scene(backend, batch, count, device)
     actuation.requires_grad_()

@@ -58,8 +58,8 @@ class TorchEnv:
         action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
             ``"grid"``: (x, y), as in the reference implementation. ``None`` stands for ``"image"``.
         resample: Draw new particles at every reset, not only at a seeded one.
-        deterministic: Refuse what does not repeat bit by bit: CUDA, and the backend ``"compile"``.
-        segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
+        deterministic: Refuse what does not repeat bit by bit: CUDA.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
@@ -108,9 +108,8 @@ class TorchEnv:
         if (name := str(dtype).removeprefix("torch.")) not in DTYPES:
             raise ValueError(f"dtype must be one of {tuple(DTYPES)}, got {name!r}")
         self.dtype, self.device = DTYPES[name], find_device(device)
-        if deterministic and (self.device.type != "cpu" or backend == "compile"):
-            needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
-            raise ValueError(f"{needs}, got {device!r} and {backend!r}")
+        if deterministic and self.device.type != "cpu":
+            raise ValueError(f"deterministic=True needs device 'cpu', got {device!r}")
         self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         if action_layout not in ("image", "grid", None):

@@ -10,7 +10,6 @@ from torchmpm import diagnostics, sampling, tree
 from torchmpm.boundary import VelocityRule, fixed
 from torchmpm.grid import Grid
 from torchmpm.materials import Body, Elastic, Material, Snow, VonMises, lame
-from torchmpm.memory import estimate_memory, segment_for
 from torchmpm.rollout import repeated, trajectory
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
@@ -28,12 +27,10 @@ __all__ = [
     "VelocityRule",
     "VonMises",
     "diagnostics",
-    "estimate_memory",
     "fixed",
     "lame",
     "repeated",
     "sampling",
-    "segment_for",
     "trajectory",
     "tree",
 ]

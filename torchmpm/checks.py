@@ -51,18 +51,16 @@ def value(name: str, given: Any, *, least: float | None = None, above: float | N
 def entries(
     name: str, given: Any, *, least: float | None = None, above: float | None = None, below: float | None = None
 ) -> None:
-    """Raise a ValueError unless all numbers of a tensor, or a number, are finite and in range.
-
-    They must be at least ``least``, above ``above`` and below ``below``, where these are given.
+    """As :func:`value`, and all numbers of a tensor must be finite and in range, and below ``below`` where it is given.
 
     Under ``torch.func`` and ``torch.compile``, where nothing can depend on them, they are not looked at.
     """
+    value(name, given, least=least, above=above)
     if isinstance(given, Tensor):
         if not (transforming() or torch.compiler.is_compiling() or given.is_meta):
             for extreme in torch.aminmax(given.detach()):  # NaN if one is among them
                 entries(name, extreme.item(), least=least, above=above, below=below)
         return
-    number(name, given, least=least, above=above)
     if below is not None and not given < below:
         raise ValueError(f"{name} must be below {below}, got {given}")
 

@@ -81,9 +81,9 @@ def impulses(
         :func:`momentum` over the substep while all particles are more than a cell from the ends of the window, but for
         the 1e-10 kg that are added to the mass of a node. Internal forces and muscles cancel.
     """
-    _check(solver, state)
-    scene = solver.scene(state, actuation, origin)
-    momentum = particles_to_grid(scene, state.planes()).momentum
+    checks.instance("solver", solver, Solver)
+    scene = solver.scene(state, actuation, solver.check_arguments(state, actuation, origin))
+    momentum = particles_to_grid(scene, state.components()).momentum
     before, damped = free_velocity(scene, momentum), grid_velocity(scene, momentum)
     accelerated, after = before + scene.gravity, constrain(scene.faces, damped)
     stages = {"gravity": (before, accelerated), "damping": (accelerated, damped), "boundary": (damped, after)}

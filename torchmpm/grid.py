@@ -61,3 +61,8 @@ class Grid:
         """Whether x (B, N), m, lies between the ends of the window from origin_x (B, 1), m; false for NaN."""
         offset = x - origin_x
         return (offset > self.margin) & (offset < self.extent)
+
+    def takes_part(self, x: Tensor, y: Tensor, origin: Tensor) -> Tensor:
+        """Which particles at (x, y), (B, N) each, m, move: those in the window at origin (B, 2), m."""
+        height = (y - origin[:, 1:2]) * (1.0 / self.h)
+        return self.contains(x, origin[:, 0:1]) & (height >= 0.0) & (height <= self.resolution)

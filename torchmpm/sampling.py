@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchmpm import checks
+from torchmpm.native.cpu.library import leave_parent_threads
 from torchmpm.tree import transforming
 
 Points = NDArray[np.float64]
@@ -48,6 +49,7 @@ def sobol(count: int, seed: int) -> Points:
     if transforming():
         raise RuntimeError("sobol must not be called under a transform of torch.func: draw the points before it")
     checks.whole("count", count, 1, LARGEST)
+    leave_parent_threads()
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(count, dtype=torch.float64).numpy()
 

@@ -11,16 +11,17 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
-from torchmpm.backends import BACKENDS, compiled, missing, warn_eager
+from torchmpm.backends import BACKENDS, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
-from torchmpm.materials.base import Value
-from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import load
+from torchmpm.materials.base import Value, try_law
+from torchmpm.materials.body import Body, per_particle, slices
+from torchmpm.native.cpu.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.kernels import Kernels
-from torchmpm.rollout import Segment, check_repetition, note_reads, repeated, replayed
+from torchmpm.native.tables import KINDS
+from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
-from torchmpm.substep import Planes, Scene, substep
+from torchmpm.substep import Components, Scene, substep
 from torchmpm.tree import transforming
 
 
@@ -39,8 +40,7 @@ class Solver:
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
         backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
-            (operator by operator), ``"compile"`` (the same through ``torch.compile``, for devices without native
-            kernels), or ``"auto"``: native on a CPU where it works, else eager.
+            (operator by operator), or ``"auto"``: native on a CPU where it works, else eager.
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`, and gravity with which a particle at rest crosses a
             cell of the grid within a substep.
 
@@ -81,6 +81,7 @@ class Solver:
     allow_unstable: bool = False
 
     def __post_init__(self) -> None:
+        leave_parent_threads()
         checks.instance("grid", self.grid, Grid)
         checks.instances("bodies", self.bodies, Body)
         if not self.bodies:
@@ -102,9 +103,8 @@ class Solver:
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
-        lack = missing(self.backend)
-        if lack is not None and not torch.cuda.is_available():
-            raise ValueError(f"backend {self.backend!r} {lack}")
+        if self.backend == "native" and not torch.cuda.is_available() and not provenance():
+            raise ValueError(f"backend 'native' {NO_COMPILER}")
         for name, tensor in self.constants.items():
             if tensor.is_floating_point() and tensor.numel():  # a material may have tensors of all kinds
                 checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
@@ -196,9 +196,9 @@ class Solver:
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0). An element whose origin
                 is not finite, or far from its matter, does not move and harms no other.
-            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
-                :func:`torchmpm.segment_for`. The native backend keeps the start of a segment and replays its substeps
-                onto a tape; ``"auto"`` and ``None`` make its segments as long as the memory that it keeps for tapes.
+            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`. The native
+                backend keeps the start of a segment and replays its substeps onto a tape; ``"auto"`` and ``None`` make
+                its segments as long as the memory that it keeps for tapes.
 
         Returns:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
@@ -211,27 +211,24 @@ class Solver:
         """
         if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
             raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
+        leave_parent_threads()
         substeps, segment = check_repetition(substeps, segment, "substeps")
-        origin = self._check_arguments(state, actuation, origin)
+        origin = self.check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
-        reads: dict[str, Any] = {}
-        if not torch.compiler.is_compiling():
-            reads = {"origin": origin} | self.constants
-            note_reads({"actuation": actuation, **reads})
         if self.runs_native(state, actuation, origin):
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
-        function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
-        scene, run, planes = self.scene(state, actuation, origin), partial(function, self), state.planes()
-        if self._can_replay(state, actuation, origin):
-            planes = replayed(run, scene, planes, substeps, segment)
+        self._try_laws(state)
+        scene = self.scene(state, actuation, origin)
+        if self._reads_scene_alone(state, actuation, origin):
+            end = repeated(self.substep, state.components(), substeps, segment=segment, shared=scene)
         else:
-            planes = repeated(partial(run, scene), planes, substeps, segment=segment, reads=reads)
-        return ParticleState.from_stack(torch.stack(planes))
+            end = repeated(partial(self.substep, scene), state.components(), substeps, segment=segment)
+        return ParticleState.from_stack(torch.stack(end))
 
-    def substep(self, scene: Scene, planes: Planes) -> Planes:
-        """One substep of a scene, from 13 planes (B, N) to new ones; a subclass may compute it in another way."""
-        return substep(scene, planes)
+    def substep(self, scene: Scene, state: Components) -> Components:
+        """One substep of a scene, from 13 components (B, N) to new ones; a subclass may compute it in another way."""
+        return substep(scene, state)
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
@@ -240,16 +237,11 @@ class Solver:
         does.
 
         Raises:
-            ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
+            ValueError: The backend is ``"native"`` and cannot run this.
         """
         if self.backend == "eager":
             return False
-        tangents = self._has_tangents(state, *fields)
-        if self.backend == "compile":
-            if tangents:
-                raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
-            return False
-        reason = self._not_native(state.device, tangents)
+        reason = self._not_native(state.device, self._has_tangents(state, *fields))
         if self.backend == "native":
             if reason is not None:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -265,9 +257,9 @@ class Solver:
             warn_eager("the physics", reason)
         return reason is None
 
-    def _can_replay(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether all tensors that a substep reads are known; custom materials and substeps may read others."""
-        if self.backend == "compile" or type(self).substep is not Solver.substep or torch.compiler.is_compiling():
+    def _reads_scene_alone(self, state: ParticleState, *fields: Tensor | None) -> bool:
+        """Whether a substep reads no tensors but those of the scene; custom materials and substeps may read others."""
+        if type(self).substep is not Solver.substep or torch.compiler.is_compiling():
             return False
         return tree.is_open(self.bodies) and not self._has_tangents(state, *fields)
 
@@ -284,12 +276,9 @@ class Solver:
             return "the transforms of torch.func do not go through its kernels"
         return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
 
-    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share.
-
-        The state, the actuation (B, 2, G, G), Pa, and the origin (B, 2), m, are those of :meth:`step`.
-        """
-        origin, nodes = self._check_arguments(state, actuation, origin), self.grid.resolution
+    def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
+        """What the substeps of a step share; the arguments are those of :meth:`step`, checked."""
+        nodes = self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
             actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
@@ -318,7 +307,17 @@ class Solver:
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
 
-    def _check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
+    def _try_laws(self, state: ParticleState) -> None:
+        """Before the first step, call each material of somebody else once, to see whether it returns what it must."""
+        if not vars(self).get("_tried"):
+            components = [component.detach() for component in state.components()]
+            for body, part in slices(self.bodies):
+                if type(body.material) not in KINDS:
+                    a, b, c, d, Jp = (component[:, part] for component in components[8:])
+                    try_law(body.material, (a, b, c, d), Jp)
+            vars(self)["_tried"] = True
+
+    def check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
         """Check the arguments of a step; returns the origin (B, 2), m."""
         self.check_state(state)
         batch, nodes = state.batch_size, self.grid.resolution

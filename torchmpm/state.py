@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks, tree
+from torchmpm.native.cpu.library import leave_parent_threads
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
@@ -22,8 +23,8 @@ _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
 class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
 
-    The solver stores the components of a vector or matrix as separate planes behind these shapes (strides, not
-    copies), because its arithmetic runs over whole planes.
+    The solver stores each component of a vector or matrix contiguously behind these shapes (strides, not copies),
+    because its arithmetic runs over whole components.
 
     Attributes:
         x: (B, N, 2) positions in the world, m.
@@ -80,6 +81,7 @@ class ParticleState:
             ValueError: They have another shape, or are neither float32 nor float64.
             TypeError: They are not a dense tensor.
         """
+        leave_parent_threads()
         checks.tensor("x", x)
         if x.ndim not in (2, 3) or x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2) or (N, 2), got {tuple(x.shape)}")
@@ -159,21 +161,21 @@ class ParticleState:
         """
         return tree.where(mask, self, other)
 
-    def planes(self) -> tuple[Tensor, ...]:
-        """The 13 component planes, each (B, N): x, v, C and F row by row, Jp."""
+    def components(self) -> tuple[Tensor, ...]:
+        """The 13 components, each (B, N): x, v, C and F row by row, Jp."""
         fields = (self.x, self.v, self.C.flatten(-2), self.F.flatten(-2))
-        return (*(plane for field in fields for plane in field.unbind(-1)), self.Jp)
+        return (*(component for field in fields for component in field.unbind(-1)), self.Jp)
 
     @classmethod
     def from_stack(cls, stacked: Tensor) -> ParticleState:
-        """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N), so that planes stay contiguous."""
+        """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N), whose components stay contiguous."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
         return cls(x, v, C, F, stacked[12])
 
     def stack(self) -> Tensor:
-        """The :meth:`planes` as one tensor (13, B, N)."""
-        return torch.stack(self.planes())
+        """The :meth:`components` as one tensor (13, B, N)."""
+        return torch.stack(self.components())
 
 
 torch.serialization.add_safe_globals([ParticleState])  # its tensors are all that a file holds of it

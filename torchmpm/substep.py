@@ -1,6 +1,7 @@
-"""One substep of MLS-MPM (Hu et al., 2018) with APIC transfers (Jiang et al., 2015), on component planes.
+"""One substep of MLS-MPM (Hu et al., 2018) with APIC transfers (Jiang et al., 2015), on the components of a state.
 
-``substep`` reads like the algorithm in those papers: particles to grid, grid velocities, boundary, grid to particles.
+:func:`substep` reads like the algorithm in those papers: particles to grid, grid velocities, boundary, grid to
+particles.
 """
 
 from dataclasses import dataclass
@@ -12,18 +13,16 @@ from torch import Tensor
 from torchmpm import transfer, tree
 from torchmpm.boundary import Face, constrain
 from torchmpm.grid import Grid
-from torchmpm.materials.base import broadcast_plane, check_returned
+from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
-from torchmpm.materials.muscle import muscle_stress
-from torchmpm.materials.resolved import detach_unresolved, resolved_stress
-from torchmpm.spline import Stencil, stencil
+from torchmpm.transfer import Stencil, stencil
 
 #: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
 MASS_EPSILON = 1e-10
 
-#: The 13 component planes of a state, (B, N) each, see :meth:`torchmpm.ParticleState.planes`.
-Planes = tuple[Tensor, ...]
+#: The 13 components of a state, (B, N) each, see :meth:`torchmpm.ParticleState.components`.
+Components = tuple[Tensor, ...]
 
 
 @tree.register
@@ -48,32 +47,32 @@ class Scattered(NamedTuple):
 
     nodes: Stencil
     inside: Tensor  # (B, N) which particles take part
-    F: Mat2  # planes (B, N) of the returned deformation gradient
+    F: Mat2  # (B, N) each, the returned deformation gradient
     Jp: Tensor  # (B, N) plastic volume ratio
     momentum: Tensor  # (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes
 
 
-def substep(scene: Scene, planes: Planes) -> Planes:
-    """Advance all particles by one substep: from planes (B, N) to planes (B, N)."""
-    planes = detach_unresolved(scene.bodies, planes, scene.dt)
-    scattered = particles_to_grid(scene, planes)
+def substep(scene: Scene, state: Components) -> Components:
+    """Advance all particles by one substep: from components (B, N) to components (B, N)."""
+    state = _detach_unresolved(scene, state)
+    scattered = particles_to_grid(scene, state)
     velocity = grid_velocity(scene, scattered.momentum)
     velocity = constrain(scene.faces, velocity)
     v, C = transfer.grid_to_particles(scene.grid, scattered.nodes, velocity)
-    x, y = planes[:2]
+    x, y = state[:2]
     moved = (x + scene.dt * v[0], y + scene.dt * v[1], *v, *C, *scattered.F, scattered.Jp)
-    return tuple(torch.where(scattered.inside, new, old) for new, old in zip(moved, planes, strict=True))
+    return tuple(torch.where(scattered.inside, new, old) for new, old in zip(moved, state, strict=True))
 
 
-def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
+def particles_to_grid(scene: Scene, state: Components) -> Scattered:
     """First half of a substep: deform the particles, evaluate their stress, collect mass and momentum on the nodes."""
-    x, y, *others = planes
+    x, y, *others = state
     dt, grid = scene.dt, scene.grid
-    inside = takes_part(grid, x, y, scene.origin)
+    inside = grid.takes_part(x, y, scene.origin)
     nodes = stencil(grid, x, y, scene.origin)
     # Particles outside get neutral values: zero times NaN would reach the derivatives of constants that all share.
     neutral = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0)  # v, C, F and Jp at rest
-    still = (torch.where(inside, plane, number) for plane, number in zip(others, neutral, strict=True))
+    still = (torch.where(inside, component, number) for component, number in zip(others, neutral, strict=True))
     vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = still
     trial = matmul((1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3), (f0, f1, f2, f3))
     F, Jp, stress_momentum = _deform(scene, nodes, inside, trial, Jp)
@@ -83,21 +82,14 @@ def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
     return Scattered(nodes, inside, F, Jp, momentum)
 
 
-def takes_part(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Tensor:
-    """Which particles at (x, y), (B, N) each, m, move: those in the window at origin (B, 2), m."""
-    height = (y - origin[:, 1:2]) * (1.0 / grid.h)
-    return grid.contains(x, origin[:, 0:1]) & (height >= 0.0) & (height <= grid.resolution)
-
-
 def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
     """Returned deformation gradient, plastic volume ratio and ``-dt V 4/h^2 tau`` of all bodies."""
     parts: list[tuple[Tensor, ...]] = []
     for body, part in slices(scene.bodies):
         a, b, c, d = trial
         before = Jp[:, part]
-        returned = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
-        F, after = check_returned(body.material, returned, before)
-        tau = resolved_stress(body, F, before, scene.grid.h, scene.dt)
+        F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
+        tau = _stress(scene, body, F, before)
         if body.muscle and scene.actuation is not None:
             pulls = transfer.interpolate(nodes.part(part), scene.actuation)
             ax, ay = (torch.where(inside[:, part], pull, 0.0) for pull in pulls)
@@ -105,9 +97,19 @@ def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tenso
             tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])
         factor = -scene.dt * (4.0 / scene.grid.h**2) * broadcast_plane(body.volume, before, "volume")
         parts.append((*F, after, *(factor * component for component in tau)))
-    planes = zip(*parts, strict=True)
-    f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in planes)
+    components = zip(*parts, strict=True)
+    f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in components)
     return (f0, f1, f2, f3), Jp, (xx, xy, yy)
+
+
+def muscle_stress(F: Mat2, actuation: tuple[Tensor, Tensor]) -> Sym2:
+    """Kirchhoff stress F diag(a) F^T (DittoGym, Huang et al., 2024, section 3), (B, N) each, Pa.
+
+    Positive actuation a, Pa, contracts. Its directions turn and stretch with the material.
+    """
+    a, b, c, d = F
+    ax, ay = actuation
+    return ax * a * a + ay * b * b, ax * a * c + ay * b * d, ax * c * c + ay * d * d
 
 
 def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
@@ -119,3 +121,29 @@ def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
 def free_velocity(scene: Scene, momentum: Tensor) -> Tensor:
     """Velocity of the nodes before gravity, (2, B, cells), m/s, from mass and momentum (3, B, cells)."""
     return momentum[1:] * (scene.exists / (momentum[0] + MASS_EPSILON))
+
+
+def _stress(scene: Scene, body: Body, F: Mat2, Jp: Tensor) -> Sym2:
+    """Stress of a body's material, whose derivative the material may limit to what a substep resolves."""
+    limited = getattr(body.material, "resolved_stress", None)
+    if limited is None:
+        return body.material.stress(F, Jp)
+    with torch.no_grad():
+        mass, volume = (broadcast_plane(getattr(body, name), Jp, name) for name in ("mass", "volume"))
+        stable = (scene.grid.h / scene.dt) ** 2 * mass / volume
+    tau: Sym2 = limited(F, Jp, stable)
+    return tau
+
+
+def _detach_unresolved(scene: Scene, state: Components) -> Components:
+    """The same state, cut from the graph where the motion of a material is faster than a substep resolves."""
+    masks = []
+    for body, part in slices(scene.bodies):
+        unresolved = getattr(body.material, "unresolved", None)
+        mask = None if unresolved is None else unresolved(tuple(c[:, part].detach() for c in state[4:8]), scene.dt)
+        masks.append(mask)
+    if all(mask is None for mask in masks):
+        return state
+    none = [torch.zeros_like(state[0][:, part], dtype=torch.bool) for _, part in slices(scene.bodies)]
+    cut = torch.cat([other if mask is None else mask for mask, other in zip(masks, none, strict=True)], dim=1)
+    return tuple(torch.where(cut, component.detach(), component) for component in state)

@@ -57,7 +57,7 @@ def cases(**sizes: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(
         ("backend", "size"),
         [
-            pytest.param(name, size, id=f"{size}-{name}", marks=needs_compiler if name in ("compile", "native") else ())
+            pytest.param(name, size, id=f"{size}-{name}", marks=needs_compiler if name == "native" else ())
             for size in SIZES
             for name, listed in sizes.items()
             if size in listed.split()
@@ -87,7 +87,7 @@ def test_same_motion(name: str) -> None:
 EVERY = " ".join(SIZES)
 
 
-@cases(**dict.fromkeys(PEERS, EVERY), native=EVERY, compile=EVERY, eager="1x22000 1x2000 16x2000")
+@cases(**dict.fromkeys(PEERS, EVERY), native=EVERY, eager="1x22000 1x2000 16x2000")
 def test_forward(per_substep, benchmark, minima, backend: str, size: str) -> None:
     batch, count = SIZES[size]
     if backend in PEERS:
@@ -108,7 +108,7 @@ def test_forward(per_substep, benchmark, minima, backend: str, size: str) -> Non
         minima["forward", size, backend] = benchmark.stats["min"]
 
 
-@cases(**dict.fromkeys(PEERS, EVERY), native=EVERY, compile="1x22000 1x2000", eager="1x2000")
+@cases(**dict.fromkeys(PEERS, EVERY), native=EVERY, eager="1x2000")
 def test_forward_backward(per_substep, benchmark, minima, backend: str, size: str) -> None:
     batch, count = SIZES[size]
     if backend in PEERS:

@@ -17,7 +17,7 @@ from cfp.errors import NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv
 from dittogym.geometry import centre_in_window
-from torchmpm.spline import quadratic_weights
+from torchmpm.transfer import quadratic_weights
 
 #: Width of the hidden layers.
 WIDTH = 128

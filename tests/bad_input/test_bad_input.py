@@ -1,13 +1,12 @@
 """Every case of bad input gets an error that names the argument, what was given and what is allowed."""
 
-import bad_arguments
 import bad_environments
 import bad_files
 import bad_programs
 import pytest
 from bad_cases import Desk, make_trained, snapshot
 
-CASES = [*bad_arguments.CASES, *bad_environments.CASES, *bad_files.CASES, *bad_programs.CASES]
+CASES = [*bad_environments.CASES, *bad_files.CASES, *bad_programs.CASES]
 
 
 @pytest.fixture(scope="module")

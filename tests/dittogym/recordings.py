@@ -142,7 +142,7 @@ def _first_grid(data: dict[str, np.ndarray], env: reference.ReferenceEnv, record
     patch = patch_field(first, spec.patch, spec.max_actuation)
     ours = place(patch, centre_in_window(spec.patch_centre, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
-    grid = particles_to_grid(scene, start.particles.planes())
+    grid = particles_to_grid(scene, start.particles.components())
     along = torch.stack(interpolate(grid.nodes, scene.actuation), -1)[0]
 
     def on_nodes(values: torch.Tensor) -> torch.Tensor:

@@ -80,7 +80,7 @@ def test_the_tasks_own_values_change_nothing() -> None:
         for action in actions(env, 2):
             ours, theirs = env.step(action), plain.step(action)
         assert torch.equal(ours[0], theirs[0]) and torch.allclose(ours[1], theirs[1], rtol=1e-10, atol=1e-10)
-        for a, b in zip(env.state.planes(), plain.state.planes(), strict=True):
+        for a, b in zip(env.state.components(), plain.state.components(), strict=True):
             assert torch.allclose(a, b, rtol=1e-9, atol=1e-9), task
 
 
@@ -207,7 +207,7 @@ def test_only_masked_elements_change() -> None:
         env.step(action)
         twin.step(action)
     for i in (0, 2):
-        assert_same_bits([p[i] for p in env.state.planes()], [p[i] for p in twin.state.planes()])
+        assert_same_bits([p[i] for p in env.state.components()], [p[i] for p in twin.state.components()])
     env.reset(options={"reset_mask": mask})
     assert env.env_state.physics["mu"].tolist() == [100.0, 900.0, 300.0]
     env.reset(options={"reset_mask": [True, True, False]})

@@ -205,22 +205,6 @@ def test_gradient_of_friction() -> None:
     assert torch.autograd.gradcheck(lambda v: apply(listed, v), (velocity,), fast_mode=True)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"direction": "down"}, "direction must be one of .*'-y'.*got 'down'"),
-        ({"frame": "robot"}, "frame must be 'world' or 'window', got 'robot'"),
-        ({"friction": -0.1}, "friction must not be negative, got -0.1"),
-        ({"friction": math.nan}, "friction must be finite, got nan"),
-        ({"i": (4, 3)}, r"i must be an inclusive range .* got \(4, 3\)"),
-        ({"j": (4, 3)}, r"j must be an inclusive range .* got \(4, 3\)"),
-    ],
-)
-def test_rules_that_make_no_sense(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        VelocityRule(**{"direction": "-y"} | options)
-
-
 def test_friction_has_second_derivatives_at_rest() -> None:
     velocity = everywhere(0.0, 0.0).clone().requires_grad_()
     slid = apply((VelocityRule("-y", friction=0.3),), velocity)

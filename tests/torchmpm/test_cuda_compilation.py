@@ -17,7 +17,7 @@ from dataclasses import replace
 sys.path.insert(0, "tests/torchmpm")
 import torch, triton
 from native_scenes import moving, solvers
-from torchmpm.native import operator, cuda
+from torchmpm.native import kernels, cuda
 from torchmpm.native.cuda import programs
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
@@ -41,9 +41,10 @@ def compile_only(kernel, count, *arguments, **constants):
 programs.launch = compile_only
 for name, dtype in (("tensor values", torch.float32), ("soil", torch.float64), ("von Mises", torch.float64)):
     calls = []
-    operator.native_step = lambda *arguments: calls.append(arguments) or arguments[0]
+    kernels.native_step = lambda *arguments: calls.append(arguments) or arguments[0]
     state, field, origin = (t.to(dtype) for t in moving(6, 2))
-    replace(solvers(6, 2)[name], backend="native").step(state, field, substeps=3, origin=origin)
+    solver = replace(solvers(6, 2)[name], backend="native")
+    solver.step(state, field, substeps=3, origin=origin)
     ((*tensors, handle, substeps),) = calls
     cuda.forward(*tensors, handle, substeps)
     cuda.backward(*tensors, tensors[0], handle, substeps, True, name == "tensor values")

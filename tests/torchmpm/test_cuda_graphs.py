@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchmpm import Body, VonMises, tree
 from torchmpm.backends import compiler_found
-from torchmpm.native import operator
+from torchmpm.native import kernels
 from torchmpm.native.tables import Inputs
 
 pytestmark = [
@@ -26,9 +26,9 @@ graphs, programs = cuda.graphs, cuda.programs
 
 def operator_calls(run: Callable[[], object]) -> list[tuple[object, ...]]:
     """Arguments with which the operator is called."""
-    calls, step = [], operator.native_step
+    calls, step = [], kernels.native_step
     with pytest.MonkeyPatch.context() as patch, torch.no_grad():
-        patch.setattr(operator, "native_step", lambda *arguments: calls.append(arguments) or step(*arguments))
+        patch.setattr(kernels, "native_step", lambda *arguments: calls.append(arguments) or step(*arguments))
         run()
     return calls
 
@@ -69,11 +69,11 @@ class Adder(programs.Program):
 
     def __init__(self, inputs: Inputs) -> None:
         Adder.built += 1
-        self.inputs, self.sum = inputs, torch.empty_like(inputs.planes)
+        self.inputs, self.sum = inputs, torch.empty_like(inputs.components)
         self.results = (self.sum,)
 
     def run(self) -> None:
-        self.sum.copy_(self.inputs.planes + 1)
+        self.sum.copy_(self.inputs.components + 1)
 
 
 @pytest.fixture
@@ -207,7 +207,7 @@ def test_within_a_graph_of_the_caller() -> None:
     (arguments,) = operator_calls(lambda: solver.step(state, substeps=5))
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        planes = operator.native_step(*arguments)
+        planes = kernels.native_step(*arguments)
     graph.replay()
     torch.testing.assert_close(planes[0], expected.x[..., 0], rtol=0, atol=1e-12)
 

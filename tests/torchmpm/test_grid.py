@@ -22,18 +22,6 @@ def test_spacing_scales_the_window() -> None:
     assert grid.contains(x, torch.zeros(1, 1)).tolist() == [[True, False]]
 
 
-@pytest.mark.parametrize("resolution", [3, 0, -1])
-def test_too_few_nodes(resolution: int) -> None:
-    with pytest.raises(ValueError, match=f"resolution must be at least 4.*got {resolution}"):
-        Grid(resolution)
-
-
-@pytest.mark.parametrize(("spacing", "must"), [(0.0, "positive"), (-1.0, "positive"), (math.nan, "finite")])
-def test_spacing_must_be_positive(spacing: float, must: str) -> None:
-    with pytest.raises(ValueError, match=f"spacing must be {must}"):
-        Grid(8, spacing)
-
-
 @pytest.mark.parametrize("origin", [-0.31, 0.0, 2.5])
 def test_contains_tests_the_open_interval_inside_the_margin(origin: float) -> None:
     offsets = torch.tensor([[-0.1, 0.0, 0.9e-5, 1.1e-5, 0.5, 1 - 1.1e-5, 1 - 0.9e-5, 1.0, 1.2]], dtype=torch.float64)

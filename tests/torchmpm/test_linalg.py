@@ -90,11 +90,11 @@ def test_products(first: tuple[float, ...], second: tuple[float, ...]) -> None:
 
 
 @given(MATRIX)
-def test_split_gives_the_singular_values(entries: tuple[float, ...]) -> None:
+def test_polar_parts_give_the_singular_values(entries: tuple[float, ...]) -> None:
     F = torch.tensor(entries, dtype=torch.float64).view(2, 2)
-    m1, m2, n1, n2, proper = linalg.split(planes(F))
+    m1, m2, n1, n2, proper = linalg.polar_parts(planes(F))
     lengths = torch.stack((torch.hypot(m1, m2), torch.hypot(n1, n2)))
     sigma = torch.linalg.svdvals(F)
     torch.testing.assert_close(lengths, torch.stack((sigma.sum(), sigma[0] - sigma[1])), rtol=1e-12, atol=1e-12)
-    half = 0.5 * torch.stack(linalg.join(linalg.Parts(m1, m2, n1, n2, proper)))
+    half = 0.5 * torch.stack(linalg.from_polar_parts(linalg.PolarParts(m1, m2, n1, n2, proper)))
     torch.testing.assert_close(half.view(2, 2), F, rtol=0, atol=1e-15)

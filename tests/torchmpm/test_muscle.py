@@ -3,7 +3,7 @@
 import torch
 from scenes import normal
 
-from torchmpm.materials.muscle import muscle_stress
+from torchmpm.substep import muscle_stress
 
 
 def test_stress_is_the_actuation_between_two_deformations() -> None:

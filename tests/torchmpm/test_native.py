@@ -123,12 +123,10 @@ def test_unsupported_scenes_are_named() -> None:
         """Somebody's material."""
 
     body = Body(10, Own(500.0, 50.0, 60.0))
-    with pytest.raises(
-        ValueError, match="cannot run this: its kernels support the materials Elastic, VonMises, Snow, a body has Own"
-    ):
+    with pytest.raises(ValueError, match="Own"):
         robot(10, bodies=(body,), backend="native").step(lively(10))
     rules = (VelocityRule("-y"),) * 300
-    with pytest.raises(ValueError, match="at most 255 velocity rules, got 300"):
+    with pytest.raises(ValueError, match="300"):
         robot(10, rules=rules, backend="native").step(lively(10))
 
 
@@ -138,8 +136,7 @@ def test_sizes_beyond_the_kernels_addresses_are_refused() -> None:
     cpu = torch.device("cpu")
     wide = robot(1, grid=Grid(MAX_RESOLUTION + 1), dt=1e-9)
     many = robot(MAX_PARTICLES + 1)
-    assert wide.kernels.unsupported(cpu) == "its kernels take at most 16,000 nodes per axis, got 16,001"
-    assert "at most 1,073,741,824 particles per simulation, got 1,073,741,825" in str(many.kernels.unsupported(cpu))
+    assert "16,001" in str(wide.kernels.unsupported(cpu)) and "1,073,741,825" in str(many.kernels.unsupported(cpu))
     assert robot(MAX_PARTICLES, grid=Grid(MAX_RESOLUTION), dt=1e-9).kernels.unsupported(cpu) is None
 
 

@@ -114,8 +114,3 @@ def test_gradients_of_hard_soil_do_not_grow() -> None:
         for exact in (False, True)
     )
     assert limited < 100.0 < 1e6 < exact
-
-
-def test_the_switch_is_true_or_false() -> None:
-    with pytest.raises(ValueError, match="exact_gradients must be True or False, got 'no'"):
-        Snow(1.0, 1.0, exact_gradients="no")

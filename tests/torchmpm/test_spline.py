@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import normal
 
 from torchmpm.grid import PAD, Grid
-from torchmpm.spline import Stencil, gather, quadratic_weights, scatter, stencil
+from torchmpm.transfer import Stencil, gather, quadratic_weights, scatter, stencil
 
 R = 8
 GRID = Grid(R, spacing=0.25)

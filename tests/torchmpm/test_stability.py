@@ -14,7 +14,7 @@ from scenes import GRID, generator, normal, positions
 from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VonMises, lame
 from torchmpm.backends import compiler_found
 from torchmpm.materials.linalg import Mat2
-from torchmpm.materials.muscle import muscle_stress
+from torchmpm.substep import muscle_stress
 
 MU, LAM = 300.0, 200.0
 MATERIALS = {
@@ -86,7 +86,7 @@ def test_beyond_it_a_solver_is_refused_and_told_the_limit() -> None:
     named = float(re.search(r"at most (\S+) s", str(raised.value))[1])
     assert named == pytest.approx(limit, rel=1e-12)
     assert Solver(GRID, (body,), dt=named).stable_dt() == named
-    with pytest.raises(ValueError, match="allow_unstable=True accepts it"):
+    with pytest.raises(ValueError, match="allow_unstable"):
         Solver(GRID, (body,), dt=math.nextafter(named, 1.0))
     assert Solver(GRID, (body,), dt=0.1, allow_unstable=True).stable_dt() == named
 
@@ -122,42 +122,6 @@ def test_a_stiffness_with_a_graph() -> None:
     assert solver.stable_dt(torch.tensor([100.0, 0.0])) == pytest.approx(GRID.h / math.sqrt(1300.0))
 
 
-def test_shapes_that_do_not_go_together() -> None:
-    odd = Body(5, Elastic(torch.ones(2), 1.0), mass=torch.ones(3))
-    with pytest.raises(ValueError, match=r"values of bodies\[1\] must have shapes that go together"):
-        Solver(GRID, (Body(5, Elastic(1.0, 1.0)), odd))
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"material": Elastic(torch.tensor(10.0), torch.tensor(-20.0))}, r"values of bodies\[0\] .* its stiffness not"),
-        ({"mass": torch.tensor(-1.0)}, r"bodies\[0\].mass must be positive, got -1.0"),
-        ({"mass": torch.tensor(0.0)}, r"bodies\[0\].mass must be positive, got 0.0"),
-        ({"volume": torch.tensor(math.inf)}, r"bodies\[0\].volume must be finite, got inf"),
-    ],
-)
-def test_tensors_that_mean_nothing_are_refused(values: dict, message: str) -> None:
-    body = Body(**{"count": 2, "material": Elastic(MU, LAM), **values})
-    with pytest.raises(ValueError, match=message):
-        Solver(GRID, (body,))
-
-
-@pytest.mark.parametrize(
-    ("material", "constants", "message"),
-    [
-        (Elastic, {"mu": torch.tensor(math.nan), "lam": 50.0}, "mu must be finite, got nan"),
-        (Elastic, {"mu": torch.tensor([1.0, -100.0]), "lam": 50.0}, "mu must not be negative, got -100.0"),
-        (VonMises, {"mu": torch.tensor(0.0), "lam": 50.0, "yield_stress": 60.0}, "mu must be positive, got 0.0"),
-        (VonMises, {"mu": MU, "lam": LAM, "yield_stress": torch.tensor(-5.0)}, "yield_stress must not be negative"),
-        (Snow, {"mu": MU, "lam": LAM, "compression": torch.tensor(2.0)}, "compression must be below 1.0, got 2.0"),
-    ],
-)
-def test_constants_in_tensors_are_checked_like_numbers(material: type, constants: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        material(**constants)
-
-
 def test_matter_that_widens_when_it_is_pulled() -> None:
     mu, lam = lame(1000.0, -0.2)
     assert lam < 0
@@ -165,5 +129,3 @@ def test_matter_that_widens_when_it_is_pulled() -> None:
     slope = largest_slope(lambda F: material.stress(F, one))
     assert material.stiffness() == pytest.approx(slope, rel=1e-12)
     assert Elastic(torch.tensor(mu), torch.tensor(lam)).stiffness().item() == pytest.approx(slope, rel=1e-6)
-    with pytest.raises(ValueError, match=r"lam must be at least -mu, -1\.0, got -1\.5"):
-        Elastic(1.0, -1.5)

@@ -4,7 +4,7 @@ import torch
 from scenes import GRID, lively, normal
 
 from torchmpm import transfer
-from torchmpm.spline import stencil
+from torchmpm.transfer import stencil
 
 R, H = GRID.resolution, GRID.h
 
@@ -14,7 +14,7 @@ def test_affine_fields_pass_through_both_transfers() -> None:
     state = lively(200)
     B = normal(2, 2, seed=6)
     v = torch.tensor([0.3, -0.1], dtype=torch.float64) + state.x @ B.T
-    planes = state.planes()
+    planes = state.components()
     nodes = stencil(GRID, planes[0], planes[1], torch.zeros(1, 2, dtype=torch.float64))
     ones, none = torch.ones(1, 200, dtype=torch.float64), torch.zeros(1, 200, dtype=torch.float64)
     C = tuple(b.expand(1, 200) for b in B.flatten())

@@ -1,8 +1,7 @@
 """Constitutive laws: what a body is made of.
 
-``elastic``, ``von_mises`` and ``snow`` hold one law each, ``muscle`` the active stress, ``base`` what all of them share
-and ``linalg`` closed forms for 2x2 matrices. ``body`` gives particles a law, and ``resolved`` limits the derivatives of
-snow to what a substep resolves on the grid.
+``elastic``, ``von_mises`` and ``snow`` hold one law each, ``base`` what all of them share and ``linalg`` closed forms
+for 2x2 matrices. ``body`` gives particles a law.
 """
 
 from torchmpm.materials.base import Material, Value, broadcast_plane, detached_column, lame

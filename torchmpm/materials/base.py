@@ -17,16 +17,17 @@ Value: TypeAlias = float | Tensor
 class Material(Protocol):
     """Interface of a constitutive law.
 
-    All methods take ``F``, the planes (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio (B, N).
-    The backends ``"eager"`` and ``"compile"`` run any material; the native kernels know those named in
-    ``torchmpm/native/tables.py``.
+    All methods take ``F``, the components (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio
+    (B, N). The backend ``"eager"`` runs any material; the native kernels know those named in
+    ``torchmpm/native/tables.py``. A material may limit derivatives to the motion that a substep resolves, with the
+    methods ``resolved_stress`` and ``unresolved`` that :class:`torchmpm.Snow` has.
     """
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Project the trial ``F`` onto the elastic range; returns the new planes (B, N) and ``Jp`` (B, N)."""
+        """Project the trial ``F`` onto the elastic range; returns the new components (B, N) and ``Jp`` (B, N)."""
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress of the projected ``F``, planes (B, N), Pa; ``Jp`` is from before the projection."""
+        """Kirchhoff stress of the projected ``F``, components (B, N), Pa; ``Jp`` is from before the projection."""
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
         """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2 (two-dimensional)."""
@@ -35,35 +36,23 @@ class Material(Protocol):
         """Largest ratio of stress to strain (Frobenius norms) in undeformed material, Pa."""
 
 
-def check_returned(material: Material, returned: Any, Jp: Tensor) -> tuple[Mat2, Tensor]:
-    """What ``return_map`` returned, four planes and Jp of the shape of ``Jp`` (B, N), or else a TypeError."""
-    pair = isinstance(returned, tuple) and len(returned) == 2
-    if not (pair and _planes(returned[0], 4, Jp) and _planes(returned[1:], 1, Jp)):
-        allowed = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
-        raise TypeError(f"return_map of {type(material).__name__} must return {allowed}, got {_found(returned)}")
-    return returned
+def try_law(material: Material, F: Mat2, Jp: Tensor) -> None:
+    """Call a material once, with components (B, N), and raise a TypeError unless it returns as many of that shape."""
+    with torch.no_grad():
+        returned: Any = material.return_map(F, Jp)
+        if _shape_of(returned) != _shape_of((F, Jp)):
+            allowed = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
+            raise TypeError(f"return_map of {type(material).__name__} must return {allowed}, got {_shape_of(returned)}")
+        stress = material.stress(returned[0], Jp)
+        if _shape_of(stress) != _shape_of((Jp,) * 3):
+            allowed = f"three tensors of shape {tuple(Jp.shape)}"
+            raise TypeError(f"stress of {type(material).__name__} must return {allowed}, got {_shape_of(stress)}")
 
 
-def check_stress(material: Material, stress: Any, Jp: Tensor) -> Sym2:
-    """What ``stress`` returned, three planes of the shape of ``Jp`` (B, N), or else a TypeError."""
-    if not _planes(stress, 3, Jp):
-        allowed = f"three tensors of shape {tuple(Jp.shape)}"
-        raise TypeError(f"stress of {type(material).__name__} must return {allowed}, got {_found(stress)}")
-    return stress
-
-
-def _planes(given: Any, count: int, like: Tensor) -> bool:
-    """Whether these are so many tensors of the shape of another."""
-    return (
-        isinstance(given, tuple)
-        and len(given) == count
-        and all(isinstance(plane, Tensor) and plane.shape == like.shape for plane in given)
-    )
-
-
-def _found(given: Any) -> str:
+def _shape_of(given: Any) -> str:
+    """Of tensors and tuples of them."""
     if isinstance(given, tuple):
-        return f"({', '.join(map(_found, given))})"
+        return f"({', '.join(map(_shape_of, given))})"
     return f"shape {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
 
 
@@ -80,15 +69,13 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
     Raises:
         ValueError: A number is out of range, or one of a tensor.
     """
-    checks.value("young", young)
     checks.entries("young", young, least=0.0)
-    checks.value("poisson", poisson)
     checks.entries("poisson", poisson, above=-1.0, below=0.5)
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
-    """Bring a constant to a shape that broadcasts against planes (B, N).
+    """Bring a constant to a shape that broadcasts against components (B, N).
 
     Args:
         value: The constant.
@@ -125,5 +112,4 @@ def detached_column(value: Value) -> Value:
 def check_not_negative(material: object, *names: str) -> None:
     """Raise a ValueError if a constant of a material is negative or not a number."""
     for name in names:
-        checks.value(name, getattr(material, name), least=0.0)
         checks.entries(name, getattr(material, name), least=0.0)

@@ -80,7 +80,7 @@ def slices(bodies: Sequence[Body]) -> Iterator[tuple[Body, slice]]:
 
 
 def per_particle(bodies: Sequence[Body], name: str, like: Tensor) -> Tensor:
-    """The constant ``name`` of the bodies as a plane (1, N) or (B, N) over all particles; ``like`` is (B, N)."""
+    """The constant ``name`` of the bodies over all particles, (1, N) or (B, N); ``like`` is (B, N)."""
     like = like.detach()
     columns = []
     for body, part in slices(bodies):

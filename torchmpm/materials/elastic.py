@@ -11,7 +11,7 @@ from torchmpm.materials.linalg import Mat2, Sym2, det, orthogonal
 
 
 def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Sym2:
-    """Kirchhoff stress 2 mu (F - R) F^T + lam J (J - 1) I, planes (B, N), Pa; J is det F unless given."""
+    """Kirchhoff stress 2 mu (F - R) F^T + lam J (J - 1) I, components (B, N), Pa; J is det F unless given."""
     a, b, c, d = F
     r = orthogonal(F)
     e, f, g, h = a - r[0], b - r[1], c - r[2], d - r[3]
@@ -53,11 +53,11 @@ class Elastic:
             raise ValueError(f"lam must be at least -mu, {-self.mu}, got {self.lam}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """No plastic flow: the planes (B, N) of the trial ``F``, and ``Jp`` (B, N), are kept."""
+        """No plastic flow: the components (B, N) of the trial ``F``, and ``Jp`` (B, N), are kept."""
         return F, Jp
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress at ``F``, planes (B, N), Pa; see :func:`corotated_stress`. ``Jp`` only gives the shape."""
+        """Kirchhoff stress at ``F``, (B, N) each, Pa; see :func:`corotated_stress`. ``Jp`` only gives the shape."""
         return corotated_stress(F, broadcast_plane(self.mu, Jp, "mu"), broadcast_plane(self.lam, Jp, "lam"))
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:

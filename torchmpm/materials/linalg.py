@@ -1,4 +1,4 @@
-"""Closed forms for 2x2 matrices given as planes ``(F11, F12, F21, F22)``.
+"""Closed forms for 2x2 matrices given as components ``(F11, F12, F21, F22)``.
 
 Every matrix is half the sum of a scaled rotation ``[[p, -q], [q, p]]`` and a scaled reflection ``[[r, s], [s, -r]]``
 with ``p = F11 + F22, q = F21 - F12, r = F11 - F22, s = F12 + F21``. Of the vectors (p, q) and (r, s) the longer one, m,
@@ -12,13 +12,13 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-#: Planes (F11, F12, F21, F22) of a field of 2x2 matrices, all of one shape.
+#: Components (F11, F12, F21, F22) of a field of 2x2 matrices, all of one shape.
 Mat2: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
-#: Planes (xx, xy, yy) of a field of symmetric matrices.
+#: Components (xx, xy, yy) of a field of symmetric matrices.
 Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
 
 
-class Parts(NamedTuple):
+class PolarParts(NamedTuple):
     """A matrix as its rotation and reflection part."""
 
     m1: Tensor  # the longer of the two vectors
@@ -34,24 +34,24 @@ def safe_sqrt(square: Tensor) -> Tensor:
     return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
 
 
-def split(F: Mat2) -> Parts:
+def polar_parts(F: Mat2) -> PolarParts:
     """Rotation and reflection part of F."""
     a, b, c, d = F
     p, q, r, s = a + d, c - b, a - d, b + c
     proper = p.square() + q.square() >= r.square() + s.square()
     m1, m2 = torch.where(proper, p, r), torch.where(proper, q, s)
-    return Parts(m1, m2, torch.where(proper, r, p), torch.where(proper, s, q), proper)
+    return PolarParts(m1, m2, torch.where(proper, r, p), torch.where(proper, s, q), proper)
 
 
-def join(parts: Parts) -> Mat2:
-    """Twice the inverse of :func:`split`."""
+def from_polar_parts(parts: PolarParts) -> Mat2:
+    """Twice the inverse of :func:`polar_parts`."""
     m1, m2, n1, n2, proper = parts
     p, q = torch.where(proper, m1, n1), torch.where(proper, m2, n2)
     r, s = torch.where(proper, n1, m1), torch.where(proper, n2, m2)
     return p + r, s - q, q + s, p - r
 
 
-def direction(parts: Parts) -> tuple[Tensor, Tensor, Tensor]:
+def direction(parts: PolarParts) -> tuple[Tensor, Tensor, Tensor]:
     """Length of the longer part (the sum of the singular values), and its cosine and sine; (0, 1, 0) for F = 0."""
     square = parts.m1.square() + parts.m2.square()
     empty = square == 0
@@ -65,7 +65,7 @@ def orthogonal(F: Mat2) -> Mat2:
     For det F < 0 it is a reflection, so singular values stay non-negative; F = 0 gives R = I. The longer part is never
     shorter than the Frobenius norm of F, so the derivative is bounded on either side of det F = 0 (where R jumps).
     """
-    m1, m2, _, _, proper = split(F)
+    m1, m2, _, _, proper = polar_parts(F)
     square = m1.square() + m2.square()
     empty = square == 0
     inverse = torch.rsqrt(torch.where(empty, 1.0, square))

@@ -10,8 +10,10 @@ from torch import Tensor
 from torchmpm import checks, tree
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic, corotated_energy, corotated_stress
-from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, safe_sqrt, split
+from torchmpm.materials.linalg import Mat2, PolarParts, Sym2, det, direction, from_polar_parts, polar_parts, safe_sqrt
 
+#: Change of displacement gradient in a substep, ``dt |C|``, beyond which snow passes no derivative on.
+LARGEST_STRAIN = 0.03
 #: Jp stays below this. A grain that is pulled apart forever reaches the least stiffness, a tenth, at Jp = 1.23; without
 #: the bound its Jp would grow until it overflows, and spoil gradients.
 LARGEST_JP = 1e30
@@ -23,7 +25,7 @@ def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> 
     Sum and difference of the new stretches rescale the two parts of F (see ``torchmpm.materials.linalg``). First, an
     off-diagonal entry of S in F = R S below ``shear_cutoff`` is dropped, as in the reference implementation.
     """
-    parts = split(F)
+    parts = polar_parts(F)
     total, cos, sin = direction(parts)
     n1, n2 = parts.n1, parts.n2
     if shear_cutoff:
@@ -40,7 +42,7 @@ def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> 
     kept = (stretches[0] <= high) & (stretches[1] >= low)
     ratio = 0.5 * torch.where(kept, 1.0, (major - minor) / torch.where(kept | isotropic, 1.0, difference))
     mean = 0.5 * (major + minor)
-    returned = join(Parts(mean * cos, mean * sin, ratio * n1, ratio * n2, parts.proper))
+    returned = from_polar_parts(PolarParts(mean * cos, mean * sin, ratio * n1, ratio * n2, parts.proper))
     return returned, stretches[0] * stretches[1] / (major * minor)
 
 
@@ -101,7 +103,7 @@ class Snow(Elastic):
             raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {given!r}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Bring the principal stretches of ``F`` into their range; its planes (B, N), and the new ``Jp`` (B, N).
+        """Bring the principal stretches of ``F`` into their range; its components (B, N), and the new ``Jp`` (B, N).
 
         See :func:`snow_return`.
         """
@@ -111,7 +113,7 @@ class Snow(Elastic):
         return F, (Jp * reduction).clamp_max(LARGEST_JP)
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress at ``F`` and ``Jp``, planes (B, N), Pa; an inverted element rests in its mirrored shape."""
+        """Kirchhoff stress at ``F`` and ``Jp``, (B, N) each, Pa; an inverted element rests in its mirrored shape."""
         mu, lam = self.hardened(Jp)
         return corotated_stress(F, mu, lam, det(F).abs())
 
@@ -124,6 +126,28 @@ class Snow(Elastic):
         """As that of :class:`Elastic`, at Jp = 1, Pa."""
         low, high = self.hardening_range
         return min(max(1.0, low), high) * super().stiffness()
+
+    def resolved_stress(self, F: Mat2, Jp: Tensor, stable: Value) -> Sym2:
+        """As :meth:`stress`, with the derivative in F of a stiffness of at most ``stable``, (B, N) or a number, Pa.
+
+        All other derivatives are exact.
+        """
+        tau = self.stress(F, Jp)
+        if self.exact_gradients:
+            return tau
+        with torch.no_grad():
+            mu, lam = self.hardened(Jp)
+            excess = (1.0 - stable / (2.0 * (mu + lam.clamp_min(0.0)))).clamp_min(0.0)
+        removed = corotated_stress(F, excess * mu, excess * lam, det(F).abs())
+        xx, xy, yy = (value - (part - part.detach()) for value, part in zip(tau, removed, strict=True))
+        return xx, xy, yy
+
+    def unresolved(self, C: Mat2, dt: float) -> Tensor | None:
+        """Which grains with the affine matrices C, (B, N) each, 1/s, pass no derivative on; ``None`` for none."""
+        if self.exact_gradients:
+            return None
+        c0, c1, c2, c3 = C
+        return c0.square() + c1.square() + c2.square() + c3.square() > (LARGEST_STRAIN / dt) ** 2
 
     def hardened(self, Jp: Tensor) -> tuple[Tensor, Tensor]:
         """Lame parameters mu and lam at ``Jp`` (B, N), Pa."""

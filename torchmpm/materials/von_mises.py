@@ -13,7 +13,7 @@ from torch import Tensor
 from torchmpm import checks, tree
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic
-from torchmpm.materials.linalg import Mat2, Parts, join, split
+from torchmpm.materials.linalg import Mat2, PolarParts, from_polar_parts, polar_parts
 
 #: Lower bound of the principal stretches in the yield test.
 STRETCH_FLOOR = 0.05
@@ -59,14 +59,14 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     The derivative jumps at the yield surface; exactly on it this returns the elastic side.
 
     Args:
-        F: Trial deformation gradient, planes (B, N).
+        F: Trial deformation gradient, components (B, N).
         limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
 
     Returns:
-        Planes (B, N) of the returned deformation gradient.
+        Components (B, N) of the returned deformation gradient.
     """
     tanh, exp, cosh2, sinh2 = yield_surface(limit)
-    m1, m2, n1, n2, proper = split(F)
+    m1, m2, n1, n2, proper = polar_parts(F)
     sum2, difference2 = m1.square() + m2.square(), n1.square() + n2.square()
     outside = difference2 > tanh * tanh * sum2
     # Where nothing yields, harmless numbers go through the square roots, so that no infinite derivative meets a zero.
@@ -77,7 +77,9 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     yields = outside & (major > minor * exp)
     mean = 0.5 * (major * minor).sqrt()
     grow_sum, grow_difference = mean * cosh2 / total, mean * sinh2 / difference
-    returned = join(Parts(m1 * grow_sum, m2 * grow_sum, n1 * grow_difference, n2 * grow_difference, proper))
+    returned = from_polar_parts(
+        PolarParts(m1 * grow_sum, m2 * grow_sum, n1 * grow_difference, n2 * grow_difference, proper)
+    )
     a, b, c, d = (torch.where(yields, new, old) for new, old in zip(returned, F, strict=True))
     return a, b, c, d
 
@@ -104,12 +106,11 @@ class VonMises(Elastic):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.value("mu", self.mu, above=0.0)
         checks.entries("mu", self.mu, above=0.0)  # the strain at yield is a stress divided by it
         check_not_negative(self, "yield_stress")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Isochoric return of ``F`` to the yield surface, planes (B, N), and ``Jp`` (B, N) as it is.
+        """Isochoric return of ``F`` to the yield surface, components (B, N), and ``Jp`` (B, N) as it is.
 
         See :func:`von_mises_return`.
         """

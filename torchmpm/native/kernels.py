@@ -1,4 +1,4 @@
-"""Entry points of the solver: whether the kernels can run, and a step through them."""
+"""The kernels of a solver: whether they can run, a step through them, and the operators of torch that it calls."""
 
 import functools
 import importlib.util
@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,9 +15,18 @@ from torchmpm import tree
 from torchmpm.boundary import VelocityRule, node_shift
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
-from torchmpm.native import operator
 from torchmpm.native.cpu import call
-from torchmpm.native.tables import KINDS, make_tables, make_values, upload
+from torchmpm.native.tables import (
+    KINDS,
+    Cotangents,
+    Inputs,
+    Tables,
+    bodies_of,
+    make_tables,
+    make_values,
+    tables_of,
+    upload,
+)
 from torchmpm.rollout import Segment
 from torchmpm.state import ParticleState
 
@@ -69,12 +79,12 @@ class Kernels:
         return None
 
     @functools.cached_property
-    def handle(self) -> int:
-        """Handle of the tables, see :func:`torchmpm.native.tables.make_tables`."""
+    def tables(self) -> Tables:
+        """All but the values, see :func:`torchmpm.native.tables.make_tables`."""
         return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     def values(self, like: Tensor) -> Tensor:
-        """The table of values (8, 1 or B, columns) for planes like (B, N); kept where all of them are numbers."""
+        """The table of values (8, 1 or B, columns) for components like (B, N); kept where all of them are numbers."""
         key = like.dtype, like.device
         if key in self._kept:
             return self._kept[key]
@@ -100,29 +110,26 @@ class Kernels:
         given = gravity if isinstance(gravity, Tensor) else upload(tuple(gravity), state.dtype, state.device)
         gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
         values, shift = self.values(state.Jp), node_shift(self.grid, origin)
-        planes = state.stack()
+        components = state.stack()
         if torch.is_grad_enabled():
-            tensors = planes, actuation, origin, gravity, values, shift
-            planes, actuation, origin, gravity, values, shift = tree.without_inference(tensors)
+            tensors = components, actuation, origin, gravity, values, shift
+            components, actuation, origin, gravity, values, shift = tree.without_inference(tensors)
         # With gradients a call keeps its start and needs a tape of all its substeps later, whose size must be bounded.
-        limit = self.tape_limit(planes, segment) if torch.is_grad_enabled() else substeps
+        limit = self.tape_limit(components, segment) if torch.is_grad_enabled() else substeps
         for start in range(0, substeps, limit):
             length = min(limit, substeps - start)
-            planes = operator.native_step(planes, actuation, origin, gravity, values, shift, self.handle, length)
-        return ParticleState.from_stack(planes)
+            components = native_step(components, actuation, origin, gravity, values, shift, self.tables.handle, length)
+        return ParticleState.from_stack(components)
 
-    def tape_limit(self, planes: Tensor, segment: Segment = "auto") -> int:
-        """How many substeps of planes (13, B, N) the adjoint can replay at once, at most ``segment``."""
-        if planes.is_cuda:
-            limit = CUDA_TAPE_BYTES // (planes.element_size() * planes.numel())
+    def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
+        """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
+        if components.is_cuda:
+            limit = CUDA_TAPE_BYTES // (components.element_size() * components.numel())
         else:
-            limit = call.KEPT_BYTES // (self.tape_bytes(planes) * min(planes.shape[1], torch.get_num_threads()))
+            rows, batch, particles = components.shape
+            substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
+            limit = call.KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
-
-    def tape_bytes(self, planes: Tensor, share: float = 1.0) -> int:
-        """Bytes of a substep of one simulation on the tape on the CPU, with this share of the nodes near particles."""
-        rows, _, particles = planes.shape
-        return planes.element_size() * (rows * particles + int(share * 3 * self.grid.width**2))
 
 
 @functools.cache
@@ -133,3 +140,96 @@ def triton_missing(compiler: str | None, path: str | None) -> str | None:
     if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
         return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
     return None
+
+
+_INPUTS = "Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
+_NUMBERS = "int handle, int substeps"
+
+
+@torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
+def native_step(*arguments: Any) -> Tensor:
+    """Components (13, B, N) after some substeps, from the tensors of Inputs, the handle of Tables, and their number."""
+    *tensors, handle, substeps = arguments
+    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+    result = torch.empty_like(inputs.components)
+    call.run(inputs, handle, substeps, result=result)
+    return result
+
+
+@torch.library.custom_op(
+    "torchmpm::native_step_backward",
+    mutates_args=(),
+    schema=(
+        f"({_INPUTS}, Tensor result_bar, {_NUMBERS}, bool wants_field, bool wants_values) "
+        "-> (Tensor, Tensor, Tensor, Tensor, Tensor)"
+    ),
+)
+def native_step_backward(*arguments: Any) -> Cotangents:
+    """Replay the substeps, then go back.
+
+    The arguments are tensors, handle, substeps, and whether to compute derivatives in the field and in the values.
+    """
+    *tensors, handle, substeps, wants_field, wants_values = arguments
+    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+    cotangents = inputs.empty_cotangents(wants_field, wants_values)
+    wanted = {n: bar for n, bar in zip(call.COTANGENTS, cotangents, strict=True) if bar.numel()}
+    call.run(inputs, handle, substeps, **wanted)
+    return cotangents
+
+
+@native_step.register_kernel("cuda")
+def _(*arguments: Any) -> Tensor:
+    from torchmpm.native import cuda  # not at the top: it imports Triton
+
+    return cuda.forward(*arguments)
+
+
+@native_step_backward.register_kernel("cuda")
+def _(*arguments: Any) -> Cotangents:
+    from torchmpm.native import cuda
+
+    return cuda.backward(*arguments)
+
+
+@native_step.register_fake
+def _(components: Tensor, *_: object) -> Tensor:
+    return torch.empty_like(components, memory_format=torch.contiguous_format)
+
+
+@native_step_backward.register_fake
+def _(*arguments: Any) -> Cotangents:
+    *tensors, _handle, _substeps, wants_field, wants_values = arguments
+    return Inputs(*tensors).empty_cotangents(wants_field, wants_values)
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *tensors, ctx.handle, ctx.substeps = inputs
+    ctx.tables = tables_of(ctx.handle)  # the solver may be gone when the backward pass needs them
+    ctx.save_for_backward(*tensors)
+
+
+def _backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
+    saved, wanted = ctx.saved_tensors, ctx.needs_input_grad[:5]
+    wants_field, wants_values = wanted[1], wanted[4]
+    *found, values_bar = native_step_backward(*saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values)
+    found.append(_sum_shared(values_bar, saved[4], ctx.handle) if wants_values else None)
+    return (*(bar if wants else None for bar, wants in zip(found, wanted, strict=True)), None, None, None)
+
+
+def _sum_shared(bar: Tensor, values: Tensor, handle: int) -> Tensor:
+    """Sum derivatives per particle (8, B, N) over the particles and simulations that share a value."""
+    if values.shape[1] == 1:
+        bar = bar.sum(1, keepdim=True)
+    columns = []
+    for body in bodies_of(handle):
+        part = bar[:, :, body.first : body.first + body.count]
+        columns.append(part if body.varying else part.sum(2, keepdim=True))
+    return torch.cat(columns, dim=2)
+
+
+def _no_second_derivative(ctx: Any, *_: Tensor) -> None:
+    raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
+
+
+native_step.register_autograd(_backward, setup_context=_setup_context)
+native_step_backward.register_autograd(_no_second_derivative)

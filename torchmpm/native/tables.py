@@ -5,6 +5,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor
@@ -59,7 +60,12 @@ class RuleTable(ctypes.Structure):
 
 
 class Tables(ctypes.Structure):
-    """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``)."""
+    """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``).
+
+    Operators of torch, which take numbers and tensors, know it by its ``handle``, for :func:`tables_of`.
+    """
+
+    handle: int
 
     _fields_ = [
         *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
@@ -69,51 +75,55 @@ class Tables(ctypes.Structure):
     ]
 
 
-#: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
+#: Derivatives in components, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
 #: particle. Those that are not wanted are empty.
-Bars = tuple[Tensor, ...]
+Cotangents = tuple[Tensor, ...]
 
 
 class Inputs(NamedTuple):
     """Tensors of a call, a tree for ``torchmpm.tree``."""
 
-    planes: Tensor  # (13, B, N) components of the state, see ParticleState.planes
+    components: Tensor  # (13, B, N) components of the state, see ParticleState.components
     field: Tensor | None  # (B, 2, G, G) muscle actuation on the nodes, Pa
     origin: Tensor  # (B, 2) lower left corner of the window, m
     gravity: Tensor  # (B, 2) acceleration, m/s^2
     values: Tensor  # (8, 1 or B, columns) from make_values
     shift: Tensor  # (B, 2) int64, nodes between the world's origin and the window's
-    result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new planes, for the adjoint
+    result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new components, for the adjoint
 
-    def empty_bars(self, wants_field: bool, wants_values: bool) -> Bars:
+    def empty_cotangents(self, wants_field: bool, wants_values: bool) -> Cotangents:
         """Room for the derivatives."""
-        nothing = self.planes.new_empty(0)
+        nothing = self.components.new_empty(0)
         return (
-            torch.empty_like(self.planes, memory_format=torch.contiguous_format),
+            torch.empty_like(self.components, memory_format=torch.contiguous_format),
             torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
             torch.empty_like(self.origin),
             torch.empty_like(self.gravity),
-            self.planes.new_empty(VALUES, *self.planes.shape[1:]) if wants_values else nothing.clone(),
+            self.components.new_empty(VALUES, *self.components.shape[1:]) if wants_values else nothing.clone(),
         )
 
 
-_handles: dict[bytes, int] = {}
-_by_handle: dict[int, Tables] = {}
+#: Tables by their contents and by their handles, for as long as a solver or a graph uses them.
+_by_content: WeakValueDictionary[bytes, Tables] = WeakValueDictionary()
+_by_handle: WeakValueDictionary[int, Tables] = WeakValueDictionary()
 _next_handle = itertools.count()
 
 
-def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> int:
-    """Describe a solver to the kernels; its handle, which operators of torch can take, is for :func:`tables_of`."""
+def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> Tables:
+    """Describe a solver to the kernels; equal solvers share their tables."""
     directions = list(dict.fromkeys(rule.direction for rule in rules))
     rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
     body_tables = (BodyTable * len(bodies))(*_body_tables(bodies, dt))
+    sizes = (grid.resolution, len(bodies), len(rules))
     numbers = (grid.h, dt, grid.margin, grid.extent, damping, MASS_EPSILON, STRETCH_FLOOR)
-    key = bytes(Tables(grid.resolution, len(bodies), len(rules), *numbers)) + bytes(body_tables) + bytes(rule_tables)
-    if key not in _handles:
-        handle = next(_next_handle)  # another thread may do the same at this moment, with a handle of its own
-        _by_handle[handle] = Tables(grid.resolution, len(bodies), len(rules), *numbers, body_tables, rule_tables)
-        _handles.setdefault(key, handle)
-    return _handles[key]
+    content = bytes(Tables(*sizes, *numbers)) + bytes(body_tables) + bytes(rule_tables)
+    tables = _by_content.get(content)
+    if tables is None:  # another thread may do the same at this moment, with a handle of its own
+        tables = Tables(*sizes, *numbers, body_tables, rule_tables)
+        tables.handle = next(_next_handle)
+        _by_handle[tables.handle] = tables
+        tables = _by_content.setdefault(content, tables)
+    return tables
 
 
 def tables_of(handle: int) -> Tables:
@@ -169,14 +179,14 @@ def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Te
         if all(isinstance(row, (int, float)) for row in rows):
             tables.append(upload(tuple(float(row) for row in rows), like.dtype, like.device).view(VALUES, 1, 1))
         else:
-            planes = [_plane(row, like) for row in rows]
-            tables.append(torch.stack(torch.broadcast_tensors(*planes)))
+            components = [_plane(row, like) for row in rows]
+            tables.append(torch.stack(torch.broadcast_tensors(*components)))
     batch = max(table.shape[1] for table in tables)
     return torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous()
 
 
 def _plane(row: Value, like: Tensor) -> Tensor:
-    """A number, or a tensor, as a plane that broadcasts against ``like`` (B, N)."""
+    """A number, or a tensor, as a component that broadcasts against ``like`` (B, N)."""
     if isinstance(row, Tensor) and row.device == like.device:
         row = row.to(like)
         return row.reshape(1, 1) if row.ndim == 0 else row

@@ -148,7 +148,7 @@ private:
     void finish() {
         const Call& call = scene.call;
         forward.own_blocks([&](int, int block) {
-            store(scene, block, element, work.bars[block], call.planes_bar);
+            store(scene, block, element, work.bars[block], call.components_bar);
             if (work.values_bar) store_values(block);
         });
         if (call.field_bar) store_field();

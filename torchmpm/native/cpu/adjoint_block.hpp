@@ -165,8 +165,6 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
         const Real pxx = h * momentum.affine[0][k], pxy = h * momentum.affine[1][k];
         const Real pyx = h * momentum.affine[2][k], pyy = h * momentum.affine[3][k];
         const Real gx = momentum.act_bar[0][k], gy = momentum.act_bar[1][k];
-        const Real slope_x[3] = {fx - Real(1.5), 2 - 2 * fx, fx - Real(0.5)};
-        const Real slope_y[3] = {fy - Real(1.5), 2 - 2 * fy, fy - Real(0.5)};
         Real fx_bar = 0, fy_bar = 0, masses = 0;
         three([&](int p) {
             Real row = 0, row_slope = 0, row_x = 0, row_y = 0, row_mass = 0;
@@ -180,11 +178,11 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
                 const Real along_y = cxy * vx + cyy * vy + pxy * px + pyy * py;
                 value += (p - fx) * along_x + (q - fy) * along_y;
                 const Real w = at.wy[q][k];
-                row += w * value, row_slope += slope_y[q] * value;
+                row += w * value, row_slope += weight_slope(fy, q) * value;
                 row_x += w * along_x, row_y += w * along_y, row_mass += w * m;
             });
             const Real w = at.wx[p][k];
-            fx_bar += slope_x[p] * row - w * row_x;
+            fx_bar += weight_slope(fx, p) * row - w * row_x;
             fy_bar += w * (row_slope - row_y);
             masses += w * row_mass;
         });
@@ -199,14 +197,14 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
     }
 }
 
-// Snow that moves faster than a substep resolves passes no derivative on, see torchmpm/materials/resolved.py.
+// Snow that moves faster than a substep resolves passes no derivative on, see Snow in torchmpm/materials/snow.py.
 PASS void drop_unresolved(Bounds bounds, const Block& state, Block& bar) {
     const Real limit = square(LARGEST_STRAIN * bounds.resolved_rate);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
         const bool drop = square(state.v[C0][k]) + square(state.v[C1][k]) + square(state.v[C2][k]) +
                               square(state.v[C3][k]) > limit;
-        for (int c = 0; c < PLANES; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
+        for (int c = 0; c < COMPONENTS; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
     }
 }
 

@@ -16,7 +16,7 @@ from torchmpm.native.tables import Inputs, Tables, tables_of
 KEPT_BYTES = 2**28
 _kept: list[Tensor] = []
 #: Derivatives that the adjoint writes.
-BARS = ("planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
+COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
 class _Call(ctypes.Structure):
@@ -26,19 +26,19 @@ class _Call(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("batch", "particles", "substeps", "threads")),
         *((name, ctypes.c_void_p) for name in POOL),
         ("tables", ctypes.POINTER(Tables)),
-        *((name, ctypes.c_void_p) for name in ("planes", "field", "origin", "shift", "gravity", "values")),
+        *((name, ctypes.c_void_p) for name in ("components", "field", "origin", "shift", "gravity", "values")),
         *((name, ctypes.c_int64) for name in ("values_batch", "columns")),
-        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *BARS)),
+        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *COTANGENTS)),
     ]
 
 
 def run(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
-    """Advance all simulations and write ``result``, or go back through the substeps and write some of :data:`BARS`.
+    """Advance all simulations and write ``result``, or go back and write some of :data:`COTANGENTS`.
 
     All tensors are contiguous.
     """
     name = "torchmpm_forward" if "result" in outputs else "torchmpm_backward"
-    library, (_, batch, particles) = load(inputs.planes.dtype), inputs.planes.shape
+    library, (_, batch, particles) = load(inputs.components.dtype), inputs.components.shape
     call = _Call(
         batch=batch,
         particles=particles,

@@ -31,9 +31,12 @@ _lock = threading.Lock()
 POOL = ("pool_parallel", "pool_rank", "pool_team_size")
 
 
+#: Whether this process was forked and has not computed yet.
+_forked = False
+
+
 @functools.cache
-def thread_pool() -> dict[str, int]:
-    """Addresses of the functions through which torch's OpenMP threads are reached; empty if it uses other threads."""
+def _pool() -> dict[str, int]:
     functions = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
     program = ctypes.CDLL(None)
     if not all(hasattr(program, function) for function in functions):
@@ -42,12 +45,28 @@ def thread_pool() -> dict[str, int]:
     return {name: address for name, address in zip(POOL, addresses, strict=True) if address}
 
 
+def thread_pool() -> dict[str, int]:
+    """Addresses of the functions through which torch's OpenMP threads are reached; empty if it uses other threads."""
+    leave_parent_threads()
+    return _pool()
+
+
+def leave_parent_threads() -> None:
+    """In a forked process that is about to compute for the first time, compute with one thread from now on.
+
+    The threads of its parent are not there, but GNU OpenMP would wait for them for ever. Forked processes that do not
+    use this package keep their number of threads.
+    """
+    global _forked
+    if _forked:
+        _forked = False
+        _pool().clear()
+        torch.set_num_threads(1)
+
+
 def _after_fork() -> None:
-    """Reach no threads in a forked process: those of its parent are not there, and waiting for them would never end."""
-    global _lock
-    thread_pool().clear()
-    torch.set_num_threads(1)
-    _lock = threading.Lock()  # another thread may have held it
+    global _forked, _lock
+    _forked, _lock = True, threading.Lock()  # another thread may have held the lock
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

@@ -19,21 +19,21 @@ INLINE Real det(Mat2 m) { return m.a * m.d - m.b * m.c; }
 
 // The larger of the two parts as (m1, m2), the smaller as (n1, n2); `sign` is 1 if the larger one is the rotation, else
 // -1. A factor costs less than choosing each number.
-struct Parts {
+struct PolarParts {
     Real m1, m2, n1, n2, sign;
 };
 
-INLINE Parts split(Mat2 F, Real sign) {
+INLINE PolarParts polar_parts(Mat2 F, Real sign) {
     return {F.a + sign * F.d, F.c - sign * F.b, F.a - sign * F.d, F.c + sign * F.b, sign};
 }
 
-INLINE Parts split(Mat2 F) {
+INLINE PolarParts polar_parts(Mat2 F) {
     const Real rotation = square(F.a + F.d) + square(F.c - F.b), reflection = square(F.a - F.d) + square(F.b + F.c);
-    return split(F, rotation >= reflection ? Real(1) : Real(-1));
+    return polar_parts(F, rotation >= reflection ? Real(1) : Real(-1));
 }
 
-// Twice the inverse of split, which is also its adjoint.
-INLINE Mat2 join(Parts v) { return {v.m1 + v.n1, v.sign * (v.n2 - v.m2), v.m2 + v.n2, v.sign * (v.m1 - v.n1)}; }
+// Twice the inverse of polar_parts, which is also its adjoint.
+INLINE Mat2 from_polar_parts(PolarParts v) { return {v.m1 + v.n1, v.sign * (v.n2 - v.m2), v.m2 + v.n2, v.sign * (v.m1 - v.n1)}; }
 
 // Length and direction of the larger part: the sum of the singular values, and the orthogonal factor R of F = R S.
 struct Direction {
@@ -42,21 +42,21 @@ struct Direction {
     bool empty;
 };
 
-INLINE Direction direction(Parts v) {
+INLINE Direction direction(PolarParts v) {
     const Real length2 = square(v.m1) + square(v.m2);
     const bool empty = length2 == 0;
     const Real total = std::sqrt(empty ? Real(1) : length2), inverse = 1 / total;
     return {empty ? Real(0) : total, inverse, empty ? Real(1) : v.m1 * inverse, v.m2 * inverse, v.sign, empty};
 }
 
-INLINE Mat2 orthogonal(Direction d) { return join({d.cos, d.sin, 0, 0, d.sign}); }
+INLINE Mat2 orthogonal(Direction d) { return from_polar_parts({d.cos, d.sin, 0, 0, d.sign}); }
 
 // Derivatives in a direction, and those in the larger part that follow from them.
 struct DirectionBar {
     Real total, cos, sin;
 };
 
-INLINE Parts adjoint(Direction d, DirectionBar bar, Real n1, Real n2) {
+INLINE PolarParts adjoint(Direction d, DirectionBar bar, Real n1, Real n2) {
     const Real turn = (d.sin * bar.cos - d.cos * bar.sin) * d.inverse;
     const Real m1 = d.sin * turn + bar.total * d.cos, m2 = bar.total * d.sin - d.cos * turn;
     return {d.empty ? Real(0) : m1, d.empty ? bar.sin : m2, n1, n2, d.sign};

@@ -19,7 +19,7 @@ struct Values {
 };
 constexpr int VALUES = 8;
 constexpr Real LARGEST_JP = Real(1e30);      // as in snow.py
-constexpr Real LARGEST_STRAIN = Real(0.03);  // as in resolved.py
+constexpr Real LARGEST_STRAIN = Real(0.03);  // as in snow.py
 
 // Column k of a block whose particles have their own values, or the only column.
 template <bool varying> INLINE Values values_at(const Real* table, int k) {
@@ -39,10 +39,10 @@ struct Sym2 {
 
 // Each turns the trial deformation gradient into the returned one in place, and returns the direction of R, the same for
 // both.
-INLINE Direction elastic_return(const Mat2& F) { return direction(split(F)); }
+INLINE Direction elastic_return(const Mat2& F) { return direction(polar_parts(F)); }
 
 INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
-    const Parts v = split(F);
+    const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
     const bool outside = small > m.tanh2 * large;
@@ -52,7 +52,7 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     const bool yields = outside & (major > minor * m.exp);
     const Real mean = Real(0.5) * std::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 / difference);
-    const Mat2 returned = join(
+    const Mat2 returned = from_polar_parts(
         {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.sign});
     F = select(yields, returned, F);
     return R;
@@ -62,7 +62,7 @@ INLINE Real clamp(Real s, Real low, Real high) { return s < low ? low : (s > hig
 
 INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
     const Real low = m.low(), high = m.high();
-    const Parts v = split(F);
+    const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real along = v.n1 * R.cos + v.n2 * R.sin;
     const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
@@ -74,7 +74,7 @@ INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const bool kept = (first <= high) & (second >= low);
     const Real ratio = Real(0.5) * (kept ? Real(1) : (major - minor) / root), sum = Real(0.5) * (major + minor);
-    F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.sign});
+    F = from_polar_parts({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.sign});
     const Real grown = Jp * (first * second / (major * minor));
     Jp = grown > LARGEST_JP ? LARGEST_JP : grown;
     return R;

@@ -10,7 +10,7 @@ struct MaterialBar {
     DirectionBar R;
 };
 
-// The hardening factor in the derivative of the stress with respect to F, see torchmpm/materials/resolved.py.
+// The hardening factor in the derivative of the stress with respect to F, see Snow in torchmpm/materials/snow.py.
 template <Kind kind> INLINE Real tangent_hardening(const Values& m, Bounds bounds, Real hard) {
     if (kind != Kind::snow) return hard;
     const Real limit = 4 * bounds.resolved_rate * m.mass / (-m.factor * (m.mu2 + 2 * at_least(m.lam, 0)));
@@ -25,7 +25,7 @@ INLINE void stress_adjoint(const Values& m, Real hard, Real tangent, Mat2 F, Dir
     const Mat2 D = F + Real(-1) * orthogonal(R);
     const Real mu2 = tangent * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
     const Mat2 D_bar{mu2 * (xx * F.a + xy * F.c), mu2 * (xx * F.b + xy * F.d), mu2 * yy * F.c, mu2 * yy * F.d};
-    const Parts R_bar = split(D_bar, R.sign);
+    const PolarParts R_bar = polar_parts(D_bar, R.sign);
     out.R = {0, -R_bar.m1, -R_bar.m2};
 
     const Real signed_J = det(F), J = kind == Kind::snow ? std::abs(signed_J) : signed_J;
@@ -60,11 +60,11 @@ template <Kind kind> INLINE Real hardening_adjoint(const Values& m, Bounds bound
 
 // Each turns the derivative in the returned F, and that in R which the stress left in `bar`, into that in the trial F.
 INLINE void elastic_adjoint(Mat2 F, MaterialBar& bar, Mat2& F_bar) {
-    F_bar = F_bar + join(adjoint(direction(split(F)), bar.R, 0, 0));
+    F_bar = F_bar + from_polar_parts(adjoint(direction(polar_parts(F)), bar.R, 0, 0));
 }
 
 INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBar& bar, Mat2& F_bar) {
-    const Parts v = split(F);
+    const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
     const bool outside = small > m.tanh2 * large;
@@ -76,7 +76,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     const Real mean = Real(0.5) * std::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 * inverse);
 
-    const Parts v_bar = split(F_bar, v.sign);
+    const PolarParts v_bar = polar_parts(F_bar, v.sign);
     const Real of_total = v_bar.m1 * R.cos + v_bar.m2 * R.sin, of_difference = v_bar.n1 * v.n1 + v_bar.n2 * v.n2;
     const Real mean_bar = of_total * m.cosh2 + of_difference * m.sinh2 * inverse;
     const Real major_bar = first >= bounds.stretch_floor ? mean_bar * mean / (2 * major) : 0;
@@ -90,7 +90,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     bar.R.sin += yields ? grow_total * v_bar.m2 : 0;
     const Real n1 = yields ? grow_difference * v_bar.n1 + along * v.n1 : 0;
     const Real n2 = yields ? grow_difference * v_bar.n2 + along * v.n2 : 0;
-    F_bar = select(yields, Mat2{}, F_bar) + join(adjoint(R, bar.R, n1, n2));
+    F_bar = select(yields, Mat2{}, F_bar) + from_polar_parts(adjoint(R, bar.R, n1, n2));
 }
 
 // Repeats the lines of snow_return: a struct of intermediate values would keep the compiler from vectorising the return
@@ -98,7 +98,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
 // part of it that reaches Jp before.
 INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, MaterialBar& bar, Mat2& F_bar, Real& Jp_bar) {
     const Real low = m.low(), high = m.high();
-    const Parts v = split(F);
+    const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real along = v.n1 * R.cos + v.n2 * R.sin;
     const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
@@ -114,7 +114,7 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     Jp_bar = Jp * reduction > LARGEST_JP ? Real(0) : Jp_bar;
     const Real reduction_bar = Jp_bar * Jp;
 
-    const Parts v_bar = split(F_bar, v.sign);
+    const PolarParts v_bar = polar_parts(F_bar, v.sign);
     const Real sum_bar = v_bar.m1 * R.cos + v_bar.m2 * R.sin;
     const Real ratio_bar = kept | isotropic ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
     const Real major_bar = Real(0.5) * (sum_bar + ratio_bar / root) - reduction_bar * reduction / major;
@@ -134,7 +134,7 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     bar.R.cos += sum * v_bar.m1 + (drop ? along * n1_bar + along_bar * v.n1 : 0);
     bar.R.sin += sum * v_bar.m2 + (drop ? along * n2_bar + along_bar * v.n2 : 0);
     n1_bar = drop ? along_bar * R.cos : n1_bar, n2_bar = drop ? along_bar * R.sin : n2_bar;
-    F_bar = join(adjoint(R, bar.R, n1_bar, n2_bar));
+    F_bar = from_polar_parts(adjoint(R, bar.R, n1_bar, n2_bar));
 }
 
 // Adjoint of return map and stress together. `F` is the trial deformation, `S_bar` the derivative in S = factor tau, and

@@ -29,7 +29,7 @@ struct Call {
     int64_t batch, particles, substeps, threads;
     Pool pool;
     const Tables* tables;
-    const Real* planes;      // (13, batch, particles)
+    const Real* components;      // (13, batch, particles)
     const Real* field;       // (batch, 2, resolution, resolution)
     const Real* origin;      // (batch, 2)
     const int64_t* shift;    // (batch, 2) whole nodes between the world's origin and the window's
@@ -39,7 +39,7 @@ struct Call {
     Real* result;            // (13, batch, particles)
     // Backward only: derivative of a loss in the result, and room for its derivatives in the inputs.
     const Real* result_bar;  // (13, batch, particles)
-    Real *planes_bar, *field_bar, *origin_bar, *gravity_bar;
+    Real *components_bar, *field_bar, *origin_bar, *gravity_bar;
     Real* values_bar;        // (VALUES, batch, particles): always one column per particle
 };
 

@@ -48,8 +48,8 @@ PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, B
             }
         });
         const auto on = eight(at.on + k) != 0;
-        const auto update = [&](int plane, Real8 value) {
-            put(on ? value : eight(block.v[plane] + k), block.v[plane] + k);
+        const auto update = [&](int component, Real8 value) {
+            put(on ? value : eight(block.v[component] + k), block.v[component] + k);
         };
         for (int c = 0; c < 2; ++c) {
             update(X + c, eight(block.v[X + c] + k) + dt * v[c]);
@@ -201,7 +201,7 @@ private:
 
     void prepare() {
         own_blocks([&](int, int block) {
-            load(scene, block, element, scene.call.planes, work.state[block]);
+            load(scene, block, element, scene.call.components, work.state[block]);
             load_values(scene, block, element, work.values);
         });
         for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].set_row(Sums::TRIPLES);
@@ -232,8 +232,8 @@ private:
 
     // Jp is only needed for snow.
     static void record_state(const Block& block, const Body& body, Block& to) {
-        const int planes = body.kind == Kind::snow ? PLANES : JP;
-        std::copy_n(block.v[0], planes * LANES, to.v[0]);
+        const int components = body.kind == Kind::snow ? COMPONENTS : JP;
+        std::copy_n(block.v[0], components * LANES, to.v[0]);
     }
 
     void scatter_block(int index, Block& block, Sums& sums) {

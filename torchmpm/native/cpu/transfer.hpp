@@ -2,10 +2,10 @@
 #pragma once
 #include "scene.hpp"
 
-enum Plane : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, PLANES };
+enum Component : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, COMPONENTS };
 
 struct alignas(64) Block {
-    Real v[PLANES][LANES];
+    Real v[COMPONENTS][LANES];
 };
 
 // Inclusive range of nodes on the padded grid.
@@ -19,6 +19,12 @@ struct Box {
         i0 = std::min(i0, o.i0), i1 = std::max(i1, o.i1), j0 = std::min(j0, o.j0), j1 = std::max(j1, o.j1);
     }
 };
+
+// Quadratic B-spline: weight of node p of three, counted from the first, at f cells from the first, and its derivative.
+INLINE Real weight(Real f, int p) {
+    return p == 0 ? Real(0.5) * square(Real(1.5) - f) : p == 1 ? Real(0.75) - square(f - 1) : Real(0.5) * square(f - Real(0.5));
+}
+INLINE Real weight_slope(Real f, int p) { return p == 0 ? f - Real(1.5) : p == 1 ? 2 - 2 * f : f - Real(0.5); }
 
 // Weights and distances are zero for particles that do not take part.
 struct alignas(64) Stencil {
@@ -42,12 +48,10 @@ struct alignas(64) Stencil {
             Real bx = std::trunc(ux - Real(0.5)), by = std::trunc(uy - Real(0.5));
             const Real dx = inside ? ux - bx : 0, dy = inside ? uy - by : 0;
             fx[k] = dx, fy[k] = dy, on[k] = inside ? Real(1) : Real(0);
-            wx[0][k] = inside ? Real(0.5) * square(Real(1.5) - dx) : 0;
-            wx[1][k] = inside ? Real(0.75) - square(dx - 1) : 0;
-            wx[2][k] = inside ? Real(0.5) * square(dx - Real(0.5)) : 0;
-            wy[0][k] = inside ? Real(0.5) * square(Real(1.5) - dy) : 0;
-            wy[1][k] = inside ? Real(0.75) - square(dy - 1) : 0;
-            wy[2][k] = inside ? Real(0.5) * square(dy - Real(0.5)) : 0;
+            three([&](int p) INLINE_LAMBDA {
+                wx[p][k] = inside ? weight(dx, p) : 0;
+                wy[p][k] = inside ? weight(dy, p) : 0;
+            });
             // Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end.
             bx = bx > low ? bx : low, by = by > low ? by : low;
             bx = bx < high ? bx : high, by = by < high ? by : high;

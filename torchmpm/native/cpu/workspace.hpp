@@ -60,22 +60,22 @@ struct Workspace {
     }
 };
 
-// Copy the particles of a block from planes (13, batch, particles). The lanes beyond the last particle have NaN
+// Copy the particles of a block from components (13, batch, particles). The lanes beyond the last particle have NaN
 // positions, so they take no part.
-INLINE void load(const Scene& scene, int block, int64_t element, const Real* planes, Block& out) {
+INLINE void load(const Scene& scene, int block, int64_t element, const Real* components, Block& out) {
     const int count = scene.particles_in(block);
     const int64_t first = scene.first_particle(block), n = scene.call.particles, stride = scene.call.batch * n;
-    for (int c = 0; c < PLANES; ++c) {
-        const Real* from = planes + c * stride + element * n + first;
+    for (int c = 0; c < COMPONENTS; ++c) {
+        const Real* from = components + c * stride + element * n + first;
         std::copy_n(from, count, out.v[c]);
         std::fill(out.v[c] + count, out.v[c] + LANES, c == X ? std::numeric_limits<Real>::quiet_NaN() : Real(1));
     }
 }
 
-INLINE void store(const Scene& scene, int block, int64_t element, const Block& in, Real* planes) {
+INLINE void store(const Scene& scene, int block, int64_t element, const Block& in, Real* components) {
     const int64_t first = scene.first_particle(block), n = scene.call.particles, stride = scene.call.batch * n;
-    for (int c = 0; c < PLANES; ++c)
-        std::copy_n(in.v[c], scene.particles_in(block), planes + c * stride + element * n + first);
+    for (int c = 0; c < COMPONENTS; ++c)
+        std::copy_n(in.v[c], scene.particles_in(block), components + c * stride + element * n + first);
 }
 
 inline void load_values(const Scene& scene, int block, int64_t element, Real* values) {

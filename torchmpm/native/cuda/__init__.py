@@ -1,4 +1,4 @@
-"""The kernels in Triton, for tensors on CUDA; the operators of :mod:`torchmpm.native.operator` there.
+"""The kernels in Triton, for tensors on CUDA; the operators of :mod:`torchmpm.native.kernels` there.
 
 ``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels,
 in the order in which they build on each other: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the
@@ -24,14 +24,14 @@ __all__ = ["backward", "cache", "forward"]
 
 
 def forward(*arguments: Any) -> Tensor:
-    """Advance all simulations; see :func:`torchmpm.native.operator.native_step`."""
+    """Advance all simulations; see :func:`torchmpm.native.kernels.native_step`."""
     *tensors, handle, substeps = arguments
     (result,) = _run(Forward, Inputs(*tensors), handle, substeps)
     return result
 
 
 def backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """Adjoint of :func:`forward`; see :func:`torchmpm.native.operator.native_step_backward`."""
+    """Adjoint of :func:`forward`; see :func:`torchmpm.native.kernels.native_step_backward`."""
     *tensors, handle, substeps, wants_field, wants_values = arguments
     return _run(Backward, Inputs(*tensors), handle, substeps, wants_field, wants_values)
 
@@ -39,7 +39,7 @@ def backward(*arguments: Any) -> tuple[Tensor, ...]:
 def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
     """Run a program, from a graph where that works: not while the caller records a graph of their own."""
     inputs = tree.map(Tensor.contiguous, inputs)
-    planes = inputs.planes
+    planes = inputs.components
     tables = device_tables(handle, planes.dtype, planes.device)
 
     def build(own: Inputs) -> Program:

@@ -121,7 +121,7 @@ def add_matrix(planes, stride, a, b, c, d, mask):
 
 @triton.jit
 def drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, mask, KIND: tl.constexpr):
-    """Forget the derivatives in snow that moves faster than a substep resolves, see ``torchmpm.materials.resolved``."""
+    """Forget the derivatives in snow that moves faster than a substep resolves, see :class:`torchmpm.Snow`."""
     if KIND == SNOW:
         limit, zero = LARGEST_STRAIN * tl.load(bounds + 3), tl.zeros_like(c0)
         drop = mask & (c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3 > limit * limit)

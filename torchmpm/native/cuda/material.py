@@ -7,14 +7,14 @@ A particle's values are the eight numbers of :func:`torchmpm.native.tables.make_
 import triton
 import triton.language as tl
 
-from torchmpm.materials import resolved
+from torchmpm.materials import snow
 from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, matmul, split
 
 #: Places in ``tables.KINDS``.
 VON_MISES = tl.constexpr(1)
 SNOW = tl.constexpr(2)
-#: Of :mod:`torchmpm.materials.resolved`.
-LARGEST_STRAIN = tl.constexpr(resolved.LARGEST_STRAIN)
+#: Of :mod:`torchmpm.materials.snow`.
+LARGEST_STRAIN = tl.constexpr(snow.LARGEST_STRAIN)
 #: Places in the table of constants, see :class:`torchmpm.native.cuda.tables.DeviceTables`.
 H, INVERSE_H, DT, MARGIN, EXTENT, DAMPING, MASS_EPSILON, STRETCH_FLOOR, LARGEST_JP = (tl.constexpr(k) for k in range(9))
 

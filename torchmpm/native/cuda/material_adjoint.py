@@ -22,7 +22,7 @@ from torchmpm.native.cuda.material import (
 
 @triton.jit
 def tangent_hardening(hard, mass, factor, mu2, lam, bounds, KIND: tl.constexpr):
-    """The hardening factor in the derivative of the stress with respect to F, see ``torchmpm.materials.resolved``."""
+    """The hardening factor in the derivative of the stress with respect to F, see :class:`torchmpm.Snow`."""
     if KIND == SNOW:
         limit = 4.0 * tl.load(bounds + 3) * mass / (-factor * (mu2 + 2.0 * at_least(lam, 0.0)))
         hard = tl.where(limit < hard, limit, hard)

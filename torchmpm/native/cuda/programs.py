@@ -35,7 +35,7 @@ class Program:
     results: tuple[Tensor, ...]  # buffers with what the last run has found
 
     def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int, numbers: int) -> None:
-        planes, self.width = inputs.planes, tables.tables.resolution + 2 * PAD
+        planes, self.width = inputs.components, tables.tables.resolution + 2 * PAD
         self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
         self.batch, self.particles, self.cells = *planes.shape[1:], self.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
@@ -97,13 +97,13 @@ class Forward(Program):
 
     def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int) -> None:
         super().__init__(inputs, tables, substeps, SUMS.value)
-        self.state = torch.empty_like(inputs.planes)
-        self.velocity = inputs.planes.new_empty(self.batch * self.cells * 2)
+        self.state = torch.empty_like(inputs.components)
+        self.velocity = inputs.components.new_empty(self.batch * self.cells * 2)
         self.results = (self.state,)
 
     def run(self) -> tuple[Tensor, ...]:
         """Take all substeps."""
-        self.state.copy_(self.inputs.planes)
+        self.state.copy_(self.inputs.components)
         self.prepare()
         self.advance([self.state] * (self.substeps + 1), self.velocity, TAPE=False)
         return self.results
@@ -119,18 +119,18 @@ class Backward(Program):
         self, inputs: Inputs, tables: DeviceTables, substeps: int, wants_field: bool, wants_values: bool
     ) -> None:
         super().__init__(inputs, tables, substeps, ADJOINT.value)
-        planes = inputs.planes
+        planes = inputs.components
         length = -(-planes.numel() // 4) * 4  # whole fours, see tables
         self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
         self.node_bars = planes.new_empty(self.batch * self.cells * ADJOINT.value)
-        self.results = inputs.empty_bars(wants_field, wants_values)
+        self.results = inputs.empty_cotangents(wants_field, wants_values)
         self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar = self.results
 
     def run(self) -> tuple[Tensor, ...]:
         """Take all substeps, then go back."""
         assert self.inputs.result_bar is not None
         self.prepare()
-        self.tape[0].copy_(self.inputs.planes)
+        self.tape[0].copy_(self.inputs.components)
         self.advance(self.tape.unbind(), self.node_bars, TAPE=True)
         self.boxes.fill_(NOWHERE.value)
         self.bars.copy_(self.inputs.result_bar)
