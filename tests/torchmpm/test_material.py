@@ -11,6 +11,7 @@ from torch import Tensor
 from torchmpm import Elastic, VonMises, lame
 from torchmpm.materials.elastic import corotated_stress
 from torchmpm.materials.von_mises import von_mises_return, yield_surface
+from torchmpm.substep import muscle_stress
 
 MU, LAM, YIELD = 500.0, 50.0, 62.0
 LIMIT = YIELD / (2 * MU)
@@ -251,3 +252,9 @@ def test_lame() -> None:
     mu, lam = lame(young, poisson)
     torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), young)
     torch.testing.assert_close(lam / (2 * (lam + mu)), poisson)
+
+
+def test_muscle_stress_is_the_actuation_between_two_deformations() -> None:
+    F, ax, ay = normal(2, 9, 2, 2, seed=1), normal(2, 9, seed=2), normal(2, 9, seed=3)
+    expected = F @ torch.diag_embed(torch.stack((ax, ay), -1)) @ F.mT
+    torch.testing.assert_close(symmetric(muscle_stress(planes(F), (ax, ay))), expected)
