@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -262,6 +263,25 @@ class Shac(Resumable, UpdateLoop, Learner):
     def log_row(self) -> None:
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Act, see stable-baselines3's ``predict``; a policy of the state acts on the present one of the simulation."""
+        policy = self.trained_policy
+        acting = policy.attached(self.simulation) if isinstance(policy, StatePolicy) else policy
+        assert isinstance(observation, np.ndarray)
+        return acting.predict(observation, state, episode_start, deterministic)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor_adam", "critic.adam"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self.parts, "generator", "features", "_callback"]
 
     @property
     def trained_policy(self) -> StatePolicy | ActorPolicy:

@@ -8,9 +8,8 @@ from typing import Any, ClassVar, cast, get_args
 
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
-from baselines.modular.nodes import Nodes
+from baselines.modular.segments import Nodes, SegmentedEnv
 from cfp.config import Hyperparameters, LearningConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
