@@ -191,7 +191,8 @@ class Shac(Resumable, UpdateLoop, Learner):
         self.generator = torch.Generator().manual_seed(config.seed)
         networks = {"value": critic, "target": self.critic.target}
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor, **networks)
-        self.begin_episodes()
+        if self.env is not None:  # a loaded model of images can act without one
+            self.begin_episodes()
 
     def begin_episodes(self) -> None:
         """Start new episodes in all elements of the simulation."""
@@ -199,11 +200,11 @@ class Shac(Resumable, UpdateLoop, Learner):
         self._last_obs = self.simulation.observation().cpu().numpy()
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
-        env, device = self.simulation, self.simulation.device
+        resolution, device = self.config.resolution(self.stage), self.device
         if self.config.sees == "image":
-            return ImageActor(env.action_resolution).to(device), image_critic().to(device)
-        size = self.features.size(len(env.spec.bodies) - 1)
-        return StateActor(size, env.action_resolution).to(device), mlp(size, 1).to(device)
+            return ImageActor(resolution).to(device), image_critic().to(device)
+        size = self.features.size(len(self.config.make_spec().bodies) - 1)
+        return StateActor(size, resolution).to(device), mlp(size, 1).to(device)
 
     def observe(self) -> Tensor:
         """Inputs (B, ...) of the networks in the present state."""

@@ -247,14 +247,13 @@ class Collector(Resumable):
             images.append(observation[valid].cpu())
             actions.append(teacher_action[valid].cpu())
             student_action = student(drop_entries(observation, self.dropout))
-            student_action = self.enlarge(drop_entries(student_action, self.dropout, self.grid))
-            observation, done, infos = self._step(tree.where(follows, self.enlarge(teacher_action), student_action))
+            student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
+            observation, done, infos = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
             if not after_step(done, infos):
                 return None
         return Labels(torch.cat(images), torch.cat(actions))
 
-    def enlarge(self, action: Tensor) -> Tensor:
-        """Actions on the grid of the environment."""
+    def _enlarge(self, action: Tensor) -> Tensor:
         return project(action, self.env.action_resolution, self.env.spec.patch)
 
     def _step(self, action: Tensor) -> tuple[Tensor, Tensor, list[dict[str, Any]]]:
@@ -295,10 +294,11 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         with self._seeded():
             self.actor = build_actor(self.spec)
         self.actor.fix_std()
-        self.actor.to(self.simulation.device)
+        self.actor.to(self.device)
         self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor)
-        self.begin_episodes()
+        if self.env is not None:  # a loaded model can act without one
+            self.begin_episodes()
 
     def begin_episodes(self) -> None:
         """Start new episodes in all elements of the simulation, and forget all labels."""
@@ -398,7 +398,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         """Act, see stable-baselines3's ``predict``; actions are enlarged to the grid of the algorithm's environment."""
         assert isinstance(observation, np.ndarray)
         actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
-        return self.collector.enlarge(torch.from_numpy(actions)).numpy(), state
+        patch = self.config.make_spec().patch
+        return project(torch.from_numpy(actions), patch, patch).numpy(), state
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "adam"], []
