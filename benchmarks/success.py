@@ -7,8 +7,8 @@ this is faster where a policy succeeds early or never, as the recorded plan of G
 import argparse
 from dataclasses import replace
 
+import baselines.registry  # noqa: F401  (adds the algorithms)
 from baselines.compare.stats import wilson_interval
-from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
@@ -28,8 +28,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--particles", choices=("full", "lite"), default="full")
     arguments = parser.parse_args()
-    config, policies = open_policy(PROGRAM, arguments.policy, "cpu", None)
-    config = replace(config, environment=config.environment.for_evaluation(arguments.particles))
+    config, policies = open_policy(arguments.policy, "cpu", None)
+    config = replace(config, particles=arguments.particles)
     policy = policies.popitem()[1]
     case = Case("noise", action_noise=arguments.noise)
 

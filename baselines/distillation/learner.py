@@ -128,8 +128,7 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_planner()
-        _ = self.planner_resolution  # checks planner_grid
+        self.check_planner(self.planner_resolution)
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)

@@ -135,14 +135,14 @@ class Modular(SACLearner):
     @property
     def trained_policy(self) -> SegmentPolicy:
         """What has been learned so far; it must be attached to an environment."""
-        return self._acting({"resolution": self.config.resolution(self.stage)})
-
-    def _acting(self, description: dict[str, Any]) -> SegmentPolicy:
+        description = {"resolution": self.config.resolution(self.stage)}
         return SegmentPolicy(cast(ModularActor, self.trained_actor), self.config.nodes, description)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor."""
-        self._acting(description).save(path)
+        policy = self.trained_policy
+        policy.description = description
+        policy.save(path)
 
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> SegmentPolicy:

@@ -52,7 +52,7 @@ class PlannedConfig(PlannerConfig, OptimisationConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_planner()
+        self.check_planner(self.resolution(1))
         if self.num_envs != 1:
             raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.num_envs}")
 
@@ -71,11 +71,6 @@ class CEMConfig(CEMPlannerConfig, PlannedConfig):
 
     algo: str = "cem"
     """Which algorithm."""
-
-    def check(self) -> None:
-        """Check what the types do not express."""
-        super().check()
-        self.check_grid(self.resolution(1))
 
 
 def planner_preset(task: str) -> tuple[GradientPlannerConfig, Grid]:

@@ -121,17 +121,6 @@ def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
     assert gradient.isfinite().all() and gradient[:4].abs().amax((1, 2, 3)).gt(0).all() and not gradient[4:].any()
 
 
-def test_unusual_gradients_are_clipped():
-    learner, gradient = Gradient(make()), torch.ones(30, 2, 4, 4)
-    clipped, share = learner._clip(gradient)
-    assert torch.equal(clipped, gradient) and share == 0
-    spiky = gradient.clone()
-    spiky[7] *= 100
-    clipped, share = learner._clip(spiky)
-    assert torch.allclose(clipped[7], 3 * gradient[7]) and torch.equal(clipped[8], gradient[8])
-    assert share == pytest.approx(1 / 30)
-
-
 @pytest.mark.parametrize("loss", [math.nan, math.inf, 1e3])
 def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     learner = Gradient(make(substeps=1, blur=(1.0,)))

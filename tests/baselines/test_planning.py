@@ -158,17 +158,6 @@ def test_early_end_is_charged_at_the_mean_reward_of_a_step(termination_steps, ch
     assert float(value) == pytest.approx(3.0 - 1.5 * charged)
 
 
-def test_plans_end_with_the_episode():
-    env = small("shapematch", substeps=1)
-    planner, lengths = GradientPlanner(env, GradientPlannerConfig(horizon=16, commit=8, iterations=1)), []
-    for step in range(32):
-        env.step(planner.act())
-        env.detach()
-        if step % 8 == 0:
-            lengths.append(len(planner._plan))
-    assert lengths == [16, 16, 14, 6] and env.env_state.steps.item() == 32
-
-
 def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch):
     env, calls = small("run", 2), []
     planner = GradientPlanner(env, by_gradients(horizon=2, commit=1, learning_rate=0.01))
@@ -254,7 +243,7 @@ def test_samples_find_what_every_simulation_wants():
     assert plan.shape == (2, 2, 2, 4, 4) and plan.abs().max() <= 1.0
     assert (plan.mean((0, 2, 3, 4)) - target.flatten()).abs().max() < 0.1
     with pytest.raises(ConfigError, match="noise_grid must be at most 4"):
-        CEMPlanner(small("run", substeps=1), by_samples(noise_grid=5)).plan()
+        CEMPlanner(small("run", substeps=1), by_samples(noise_grid=5))
 
 
 def test_distribution_moves_to_the_elites_that_are_finite():
