@@ -50,6 +50,7 @@ from cfp.presets import sac_preset
 from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import copy_policy, load, read_policy, shipped
 from dittogym import TorchEnv, make_spec
+from dittogym.spec import DT
 from torchmpm import tree
 
 #: Teachers that are trained first if only their algorithm is named.
@@ -312,7 +313,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     def _make_teacher(self) -> Teacher:
         config = self.config
         if self.teacher_file is None and config.teacher == "mpc":
-            cheap = config.for_training().simulated_with(dt=long_dt(config.task))
+            as_usual = config.substeps is None and config.dt == DT  # others were chosen by the user
+            cheap = config.for_training().simulated_with(dt=long_dt(config.task) if as_usual else None)
             model = make_torch_env(cheap, config.planner_resolution)
             return PlannerTeacher(model, config, config.seed)
         policy = read_teacher(self.teacher_file or config.teacher, config.task, config.environment)
