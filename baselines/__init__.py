@@ -18,7 +18,7 @@ _MODULES = {
     "CEMPlanner": "baselines.planning.cem",
     "CEMPlannerConfig": "baselines.planning.cem",
     "Distill": "baselines.distillation.learner",
-    "DistillConfig": "baselines.distillation.config",
+    "DistillConfig": "baselines.distillation.learner",
     "Gradient": "baselines.trajectory",
     "GradientConfig": "baselines.trajectory",
     "GradientPlanner": "baselines.planning.gradient",

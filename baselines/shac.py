@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -196,7 +197,8 @@ class Shac(Resumable, UpdateLoop, Learner):
         self.generator = torch.Generator().manual_seed(config.seed)
         networks = {"value": critic, "target": self.critic.target}
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor, **networks)
-        self.begin_episodes()
+        if self.env is not None:  # a loaded model of images can act without one
+            self.begin_episodes()
 
     def begin_episodes(self) -> None:
         """Start new episodes in all elements of the simulation."""
@@ -204,11 +206,11 @@ class Shac(Resumable, UpdateLoop, Learner):
         self._last_obs = self.simulation.observation().cpu().numpy()
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
-        env, device = self.simulation, self.simulation.device
+        resolution, device = self.config.resolution(self.stage), self.device
         if self.config.sees == "image":
-            return ImageActor(env.action_resolution).to(device), image_critic().to(device)
-        size = self.features.size(len(env.spec.bodies) - 1)
-        return StateActor(size, env.action_resolution).to(device), mlp(size, 1).to(device)
+            return ImageActor(resolution).to(device), image_critic().to(device)
+        size = self.features.size(len(self.config.make_spec().bodies) - 1)
+        return StateActor(size, resolution).to(device), mlp(size, 1).to(device)
 
     def observe(self) -> Tensor:
         """Inputs (B, ...) of the networks in the present state."""
@@ -268,6 +270,25 @@ class Shac(Resumable, UpdateLoop, Learner):
     def log_row(self) -> None:
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Act, see stable-baselines3's ``predict``; a policy of the state acts on the present one of the simulation."""
+        policy = self.trained_policy
+        acting = policy.attached(self.simulation) if isinstance(policy, StatePolicy) else policy
+        assert isinstance(observation, np.ndarray)
+        return acting.predict(observation, state, episode_start, deterministic)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor_adam", "critic.adam"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self.parts, "generator", "features", "_callback"]
 
     @property
     def trained_policy(self) -> StatePolicy | ActorPolicy:

@@ -145,7 +145,7 @@ def gaussian_matrix(sigma: float, size: int) -> Tensor:
     return weight[4 * size + distance] / weight.sum()
 
 
-class Episode(NamedTuple):
+class Iteration(NamedTuple):
     """Result of one iteration."""
 
     loss: float  # mean over layouts and steps
@@ -216,7 +216,7 @@ class Gradient(Resumable, OpenLoopLearner):
         self.num_timesteps += self.horizon * self.env.num_envs
         return scalars | {"train/failed": float(self.failed)}
 
-    def play(self, progress: float) -> Episode:
+    def play(self, progress: float) -> Iteration:
         """Play one episode from the start, with the objective at a ``progress`` of 0 to 1 of the stage."""
         env, window = self.env, self.config.window or self.horizon
         actions = self.theta.detach().tanh().requires_grad_()
@@ -228,7 +228,7 @@ class Gradient(Resumable, OpenLoopLearner):
         for step in range(self.horizon):
             _, reward, terminated, _, info = env.step(actions[step].expand(env.num_envs, -1, -1, -1), soft=soft)
             if not bool((info["finite"] | ~running).all()):
-                return Episode(math.nan, math.nan, math.nan, actions)
+                return Iteration(math.nan, math.nan, math.nan, actions)
             value = torch.where(running, self.objective(env, reward, progress), 0.0)
             window_loss = window_loss + value.mean() / self.horizon
             size += float(value.detach().abs().mean()) / self.horizon
@@ -243,7 +243,7 @@ class Gradient(Resumable, OpenLoopLearner):
             if is_last:
                 break
         assert actions.grad is not None
-        return Episode(loss, size, total, actions.grad * (1.0 - actions.detach().square()))
+        return Iteration(loss, size, total, actions.grad * (1.0 - actions.detach().square()))
 
     def _clip(self, gradient: Tensor) -> tuple[Tensor, float]:
         """Clip each control step's gradient to `CLIP` times its mean norm; returns the fraction that was clipped."""

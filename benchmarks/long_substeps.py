@@ -131,7 +131,7 @@ def play_plan(task: str, dt: float) -> list[Episode]:
     config = MPC.preset(task, "quick")
 
     def episodes(env: dittogym.TorchEnv, model: dittogym.TorchEnv) -> list[Episode]:
-        planner = GradientPlanner(model, config.planner)
+        planner = GradientPlanner(model, config)
 
         def act(observation: Tensor, step: int) -> Tensor:
             model.env_state = env.env_state

@@ -1,35 +1,60 @@
-"""Distillation: the image networks of the coarse-to-fine policy imitate a policy or planner that sees more."""
+"""Distillation: the image networks of the coarse-to-fine policy imitate a policy or planner that sees more.
+
+By dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states.
+"""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.grid import long_dt
-from baselines.distillation import teachers
-from baselines.distillation.config import DistillConfig
-from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
+from baselines.common.grid import Grid, find_grid, long_dt
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
+from baselines.planning.gradient import GradientPlannerConfig
 from baselines.planning.mpc import planner_preset
+from baselines.registry import configure, find
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import descend
 from cfp.analytic.window import Episodes
+from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
+from cfp.envs import disturbances
 from cfp.envs.make import choose_device, make_env, make_torch_env
 from cfp.envs.seeding import seeded
-from cfp.errors import NonFiniteError
+from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
-from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, copy_coarse_weights, linear_decay
-from cfp.policy import load
+from cfp.experiment.run import TrainingRun
+from cfp.files import read_json, write_json
+from cfp.hub import is_address
+from cfp.learner import (
+    CoarseToFine,
+    NetworksPolicy,
+    Resumable,
+    UpdateLoop,
+    compress,
+    copy_coarse_weights,
+    decompress,
+    linear_decay,
+)
+from cfp.policy import copy_policy, load, read_policy, shipped
 from cfp.presets import sac_preset
-from dittogym import make_spec
+from cfp.validation import check_at_least, check_fraction, check_positive
+from dittogym import TorchEnv, make_spec
+from dittogym.spec import DT
+from torchmpm import tree
+
+#: Teachers that are trained first if only their algorithm is named.
+TRAINED = ("shac", "gradient")
 
 #: Every scalar that ``Distill.update`` logs, and what it means.
 METRICS: dict[str, str] = {
@@ -43,6 +68,209 @@ METRICS: dict[str, str] = {
     "train/terminated": "training episodes of this stage that terminated early",
     "train/nonfinite": "simulations that were not finite and were reset",
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig(GradientPlannerConfig, StagedConfig):
+    """A distillation; num_envs robots move side by side. Stages are listed coarsest first.
+
+    The environment options say where the student is evaluated; train_particles, where it is taught.
+    """
+
+    algo: str = "distill"
+    """Which algorithm."""
+    teacher: str = "shac"
+    """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
+    train_particles: Particles = "lite"
+    """Particles of the simulations in training."""
+    rollout_steps: int = 64
+    """Control steps of a round, after which the student is updated."""
+    updates: int = 48
+    """Gradient steps after a round."""
+    batch_size: int = 256
+    """Labels in a gradient step."""
+    student_noise: bool = True
+    """The student acts with the noise of its policy."""
+    student_learning_rate: float = 1e-3
+    """Adam's step size at the beginning of each stage; it falls to a tenth."""
+    max_grad_norm: float = 1.0
+    """Largest norm of the gradient."""
+    beta_decay: float = 0.7
+    """Factor by which beta, the probability that the teacher acts, falls from round to round; it starts at 1."""
+    switch_every: int = 8
+    """Control steps after which it is drawn anew whether teacher or student acts on a robot."""
+    dropout: float = 0.0
+    """Probability with which entries of the student's observations and actions are set to 0, in half of them, so that
+    it learns to do without."""
+    capacity: int = 100_000
+    """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
+    max_episode_steps: int = 400
+    """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
+    num_layouts: int = 64
+    """Particle layouts that training episodes start from in turn."""
+    planner_grid: Grid = "coarse"
+    """Action grid of the teacher mpc."""
+
+    def for_training(self: Config) -> Config:
+        """These options, with the environment that the student is taught in."""
+        assert isinstance(self, DistillConfig)
+        return self.simulated_with(self.train_particles)
+
+    @property
+    def planner_resolution(self) -> int:
+        """Action grid R of the teacher mpc."""
+        return find_grid("planner_grid", self.task, self.planner_grid)
+
+    @property
+    def update_every(self) -> int:
+        """Environment steps from one update to the next: a round of all robots."""
+        return self.rollout_steps * self.num_envs
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        self.check_planner(self.planner_resolution)
+        check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
+        check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
+        check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
+        check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
+        check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
+        check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)
+
+
+class Labels(NamedTuple):
+    """Observations and the teacher's actions."""
+
+    observations: Tensor  # (n, 3, 64, 64) uint8
+    actions: Tensor  # (n, 2, R, R) on the teacher's grid, or on the student's where that is smaller
+
+
+class Dataset:
+    """The labels of all rounds; the oldest rounds are dropped when there are too many."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.rounds: list[Labels] = []
+        self._compressed: list[Tensor | None] = []
+
+    def __len__(self) -> int:
+        """Number of labels."""
+        return sum(len(labels.observations) for labels in self.rounds)
+
+    def add(self, labels: Labels) -> None:
+        """Add a round, if it has labels; the newest is kept whole even if it alone exceeds the capacity."""
+        if not len(labels.observations):
+            return
+        self.rounds.append(labels)
+        self._compressed.append(None)
+        while len(self.rounds) > 1 and len(self) > self.capacity:
+            del self.rounds[0], self._compressed[0]
+
+    def sample(self, count: int) -> Labels:
+        """Draw labels uniformly with replacement, from torch's generator."""
+        sizes = torch.tensor([len(labels.observations) for labels in self.rounds])
+        ends = sizes.cumsum(0)
+        picks = torch.randint(int(ends[-1]), (count,))
+        rounds = torch.searchsorted(ends, picks, right=True)
+        rows = (picks - (ends - sizes)[rounds]).tolist()
+        chosen = [(self.rounds[index], row) for index, row in zip(rounds.tolist(), rows, strict=True)]
+        return Labels(*(torch.stack([labels[part][row] for labels, row in chosen]) for part in (0, 1)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """All labels; the images of each round are compressed once."""
+        for index, labels in enumerate(self.rounds):
+            if self._compressed[index] is None:
+                self._compressed[index] = compress(labels.observations)
+        return {"observations": list(self._compressed), "actions": [labels.actions for labels in self.rounds]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self._compressed = list(state["observations"])
+        images = [decompress(content, TorchEnv.observation_shape) for content in state["observations"]]
+        self.rounds = [Labels(*pair) for pair in zip(images, state["actions"], strict=True)]
+
+
+def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:
+    """Set random entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if any."""
+    if not probability:
+        return values
+    mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability
+    mask &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
+    return disturbances.drop(values, mask.to(values.device))
+
+
+class Collector(Resumable):
+    """Lets a mixture of student and teacher act, and labels the states by the teacher.
+
+    Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
+    computed from that very state, or is part of a plan which the robot has followed from its beginning.
+    """
+
+    parts = ("episodes", "teacher")
+    values = ("steps_since_switch", "teacher_acts", "restarted")
+
+    def __init__(
+        self, teacher: Teacher, episodes: Episodes, switch_every: int, dropout: float = 0.0, grid: int | None = None
+    ) -> None:
+        self.env, self.teacher, self.episodes, self.switch_every = episodes.env, teacher, episodes, switch_every
+        self.dropout, self.grid = dropout, grid
+        self.steps_since_switch = switch_every
+        self.teacher_acts = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
+        self.restarted = self.teacher_acts.clone()  # a new episode began since the teacher's plan was made
+
+    @torch.no_grad()
+    def collect(
+        self,
+        steps: int,
+        beta: float,
+        student: Callable[[Tensor], Tensor],
+        after_step: Callable[[Tensor, list[dict[str, Any]]], bool],
+    ) -> Labels | None:
+        """Act for some control steps and return the labels; None if ``after_step`` returns False.
+
+        The teacher controls a robot with probability ``beta``, drawn from torch's generator; the student maps images
+        (B, 3, 64, 64) to actions (B, 2, R, R), and loses entries of both with probability ``dropout``.
+        """
+        env, images, actions = self.env, [], []
+        self.episodes.recent_returns = []
+        observation = env.observation()
+        for _ in range(steps):
+            teacher_action = self.teacher.act(env, observation)
+            if self.teacher.fresh:
+                self.restarted = torch.zeros_like(self.restarted)
+                if self.steps_since_switch >= self.switch_every:
+                    draws = torch.rand(env.num_envs).to(env.device)
+                    self.teacher_acts, self.steps_since_switch = draws < beta, 0
+            self.steps_since_switch += 1
+            follows = self.teacher_acts & ~self.restarted
+            valid = ~self.restarted if self.teacher.fresh else follows
+            images.append(observation[valid].cpu())
+            actions.append(teacher_action[valid].cpu())
+            student_action = student(drop_entries(observation, self.dropout))
+            student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
+            observation, done, infos = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
+            if not after_step(done, infos):
+                return None
+        return Labels(torch.cat(images), torch.cat(actions))
+
+    def _enlarge(self, action: Tensor) -> Tensor:
+        return project(action, self.env.action_resolution, self.env.spec.patch)
+
+    def _step(self, action: Tensor) -> tuple[Tensor, Tensor, list[dict[str, Any]]]:
+        """Carry out an action, start new episodes where they are over; the next observation, which, and their infos."""
+        observation, reward, terminated, _, info = self.env.step(action)
+        done = self.episodes.record(reward, terminated)
+        infos = self.episodes.infos(done)
+        if bool(done.any()):
+            self.episodes.restart(done, terminated, info["finite"])
+            self.restarted = self.restarted | done
+            observation = self.env.observation()
+        return observation, done, infos
+
+
+def teacher_path(folder: Path) -> Path:
+    """The copy of the teacher in the folder of a run."""
+    return folder / "teacher.safetensors"
 
 
 class Distill(Resumable, UpdateLoop, CoarseToFine):
@@ -66,10 +294,11 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         with self._seeded():
             self.actor = build_actor(self.spec)
         self.actor.fix_std()
-        self.actor.to(self.simulation.device)
+        self.actor.to(self.device)
         self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor)
-        self.begin_episodes()
+        if self.env is not None:  # a loaded model can act without one
+            self.begin_episodes()
 
     def begin_episodes(self) -> None:
         """Start new episodes in all elements of the simulation, and forget all labels."""
@@ -84,7 +313,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     def _make_teacher(self) -> Teacher:
         config = self.config
         if self.teacher_file is None and config.teacher == "mpc":
-            cheap = config.for_training().simulated_with(dt=long_dt(config.task))
+            as_usual = config.substeps is None and config.dt == DT  # others were chosen by the user
+            cheap = config.for_training().simulated_with(dt=long_dt(config.task) if as_usual else None)
             model = make_torch_env(cheap, config.planner_resolution)
             return PlannerTeacher(model, config, config.seed)
         policy = read_teacher(self.teacher_file or config.teacher, config.task, config.environment)
@@ -159,6 +389,25 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         descend(self.adam, self.config.max_grad_norm, "student's loss")
         return value
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Act, see stable-baselines3's ``predict``; actions are enlarged to the grid of the algorithm's environment."""
+        assert isinstance(observation, np.ndarray)
+        actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
+        patch = self.config.make_spec().patch
+        return project(torch.from_numpy(actions), patch, patch).numpy(), state
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "adam"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self.parts, *self.values, "_callback"]
+
     @property
     def trained_actor(self) -> Actor:
         """The student."""
@@ -207,14 +456,44 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
 
     @classmethod
     def begin(cls, config: DistillConfig, folder: Path) -> tuple[int, int]:
-        """Copy the teacher into the folder, if it is a policy."""
-        teachers.copy_teacher(config, folder)
+        """Copy the teacher into the folder, if it is a policy; else remove what an earlier attempt has left there."""
+        teacher = config.teacher
+        if teacher in ("mpc", *TRAINED):
+            teacher_path(folder).unlink(missing_ok=True)
+            return 1, 0
+        try:
+            read_teacher(teacher, config.task, config.environment)
+        except CheckpointError as error:
+            if Path(teacher).exists() or is_address(teacher):
+                raise
+            names = ", ".join(("mpc", *TRAINED, *shipped()))
+            raise ConfigError(
+                f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}"
+            ) from error
+        copy_policy(teacher, teacher_path(folder))
         return 1, 0
 
     @classmethod
     def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
-        """Train the teacher, if only its algorithm is named."""
-        teachers.train_teacher(config, folder, signals)
+        """Train a teacher of which only the algorithm is named; what this took adds up in ``teacher/cost.json``."""
+        if config.teacher not in TRAINED or teacher_path(folder).exists():
+            return
+        chosen = configure({"algo": config.teacher, "task": config.task})
+        same = {name: getattr(config, name) for name in ("substeps", "dt", "dtype", "backend", *TASK_OPTIONS)}
+        chosen = replace(chosen, seed=config.seed, device=config.device, **same)
+        algorithm, own = find(config.teacher), folder / "teacher"
+        run = TrainingRun(algorithm, chosen, own, True, signals)
+        print(f"training the teacher first: {config.teacher} -> {own}")
+        start, begin = run.step, time.perf_counter()
+        try:
+            run.train()
+        finally:
+            cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
+            cost["evaluation_seconds"] = run.evaluation_seconds
+            path = own / "cost.json"
+            before = read_json(path) if path.exists() else {}
+            write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
+        copy_policy(policy_path(own), teacher_path(folder))
 
     @classmethod
     def create(cls, config: DistillConfig, stage: int, folder: Path) -> Distill:
@@ -222,7 +501,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         env = make_env(config.for_training(), make_spec(config.task).patch)
         device = choose_device(config.device)
         learner = cls("NetworksPolicy", env, config, stage, device, _init_setup_model=False)
-        learner.teacher_file = None if config.teacher == "mpc" else teachers.teacher_path(folder)
+        learner.teacher_file = None if config.teacher == "mpc" else teacher_path(folder)
         learner._setup_model()
         if stage > 1:
             copy_coarse_weights(learner.actor, load(policy_path(folder, stage - 1), device).actor)
@@ -231,5 +510,12 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
 
     @classmethod
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
-        """A warning if the teacher was planned for one start only."""
-        return teachers.warnings(config, folder)
+        """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
+        if config.teacher in ("mpc", *TRAINED) or "layout" not in read_policy(teacher_path(folder))[1]:
+            return []
+        if not any(body.shape.draws for body in config.make_spec().bodies):
+            return []
+        return [
+            f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
+            "evaluate it from other starts (python -m baselines.evaluate --policy), or use mpc, which plans anew"
+        ]

@@ -1,9 +1,7 @@
-"""Teachers of a distillation: a trained policy of any kind, which may be trained first, or the gradient planner."""
+"""Teachers of a distillation: a trained policy of any kind, or the gradient planner."""
 
 import functools
-import time
 from abc import ABC, abstractmethod
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +10,13 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
-from baselines.distillation.config import DistillConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
-from baselines.registry import configure, find, load
-from cfp.config import TASK_OPTIONS, EnvironmentConfig
-from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.folder import policy_path
-from cfp.experiment.process import StopSignals
-from cfp.experiment.run import TrainingRun
-from cfp.files import read_json, write_json
-from cfp.hub import is_address
+from baselines.registry import load
+from cfp.config import EnvironmentConfig
 from cfp.learner import Resumable
-from cfp.policy import Policy, StatePolicy, check_trained_for, copy_policy, read_policy, shipped
+from cfp.policy import Policy, StatePolicy, check_trained_for, read_policy
 from dittogym import TorchEnv
 from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
-
-#: Teachers that are trained first if only their algorithm is named.
-TRAINED = ("shac", "gradient")
 
 
 class Teacher(Resumable, ABC):
@@ -107,58 +95,3 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     """Load a policy that can teach a task."""
     check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
-
-
-def teacher_path(folder: Path) -> Path:
-    """The copy of the teacher in the folder of a run."""
-    return folder / "teacher.safetensors"
-
-
-def copy_teacher(config: DistillConfig, folder: Path) -> None:
-    """Copy the teacher into the folder, if it is a policy; else remove what an earlier attempt has left there."""
-    teacher = config.teacher
-    if teacher in ("mpc", *TRAINED):
-        teacher_path(folder).unlink(missing_ok=True)
-        return
-    try:
-        read_teacher(teacher, config.task, config.environment)
-    except CheckpointError as error:
-        if Path(teacher).exists() or is_address(teacher):
-            raise
-        names = ", ".join(("mpc", *TRAINED, *shipped()))
-        raise ConfigError(f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}") from error
-    copy_policy(teacher, teacher_path(folder))
-
-
-def warnings(config: DistillConfig, folder: Path) -> list[str]:
-    """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
-    if config.teacher in ("mpc", *TRAINED) or "layout" not in read_policy(teacher_path(folder))[1]:
-        return []
-    if not any(body.shape.draws for body in config.make_spec().bodies):
-        return []
-    return [
-        f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
-        "evaluate it from other starts (python -m baselines.evaluate --policy), or use mpc, which plans anew"
-    ]
-
-
-def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> None:
-    """Train a teacher that is only named and not there yet; what this took is added up in ``teacher/cost.json``."""
-    if config.teacher not in TRAINED or teacher_path(folder).exists():
-        return
-    chosen = configure({"algo": config.teacher, "task": config.task})
-    same = {name: getattr(config, name) for name in ("substeps", "dt", "dtype", "backend", *TASK_OPTIONS)}
-    chosen = replace(chosen, seed=config.seed, device=config.device, **same)
-    algorithm, own = find(config.teacher), folder / "teacher"
-    run = TrainingRun(algorithm, chosen, own, True, signals)
-    print(f"training the teacher first: {config.teacher} -> {own}")
-    start, begin = run.step, time.perf_counter()
-    try:
-        run.train()
-    finally:
-        cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
-        cost["evaluation_seconds"] = run.evaluation_seconds
-        path = own / "cost.json"
-        before = read_json(path) if path.exists() else {}
-        write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
-    copy_policy(policy_path(own), teacher_path(folder))

@@ -8,9 +8,8 @@ from typing import Any, ClassVar, cast, get_args
 
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
-from baselines.modular.nodes import Nodes
+from baselines.modular.segments import Nodes, SegmentedEnv
 from cfp.config import Hyperparameters, LearningConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
@@ -136,14 +135,14 @@ class Modular(SACLearner):
     @property
     def trained_policy(self) -> SegmentPolicy:
         """What has been learned so far; it must be attached to an environment."""
-        return self._acting({"resolution": self.config.resolution(self.stage)})
-
-    def _acting(self, description: dict[str, Any]) -> SegmentPolicy:
+        description = {"resolution": self.config.resolution(self.stage)}
         return SegmentPolicy(cast(ModularActor, self.trained_actor), self.config.nodes, description)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor."""
-        self._acting(description).save(path)
+        policy = self.trained_policy
+        policy.description = description
+        policy.save(path)
 
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> SegmentPolicy:

@@ -15,9 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from baselines.common.policies import StateBasedPolicy, load_network
-from baselines.modular.env import segment
-from baselines.modular.kmeans import fit, update
-from baselines.modular.nodes import Nodes, unpack, visible_positions
+from baselines.modular.segments import Nodes, fit, segment, unpack, update, visible_positions
 from cfp.agent.actor import Sample, SquashedActor, initialise, perceptron, sample_squashed_gaussian
 from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
@@ -66,7 +64,7 @@ class AttentionTrunk(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`."""
+    """Either trunk, reading rows of `baselines.modular.segments.Nodes`."""
 
     def __init__(self, kind: Kind, features: int, extra: int = 0) -> None:
         super().__init__()

@@ -40,8 +40,8 @@ class PlannerConfig:
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
     exceeds 0.8."""
 
-    def check_planner(self) -> None:
-        """Check what the types do not express.
+    def check_planner(self, resolution: int) -> None:
+        """Check what the types do not express, for plans on an action grid of ``resolution`` rows and columns.
 
         Raises:
             ConfigError: An option is out of range.
@@ -85,7 +85,7 @@ class Planner(Resumable, ABC, Generic[Config]):
         self, env: TorchEnv, config: Config | None = None, *, step: StepFunction | None = None, seed: int = 0
     ) -> None:
         self.config = config = config or self.config_type()
-        config.check_planner()
+        config.check_planner(env.action_resolution)
         self.env, self.step = env, step or self.default_step
         if self.step is soft_step:
             check_differentiable(env)

@@ -35,22 +35,15 @@ class CEMPlannerConfig(PlannerConfig):
     momentum: float = 0.1
     """Fraction of mean and standard deviation that each generation keeps."""
 
-    def check_planner(self) -> None:
+    def check_planner(self, resolution: int) -> None:
         """Check what the types do not express."""
-        super().check_planner()
+        super().check_planner(resolution)
         check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites must be between 2 and candidates, {self.candidates}, got {self.elites}")
         check_decay(noise_correlation=self.noise_correlation, momentum=self.momentum)
-
-    def check_grid(self, size: int) -> None:
-        """Check that the noise has no more cells than an action grid of ``size`` rows and columns.
-
-        Raises:
-            ConfigError: It has more.
-        """
-        if self.noise_grid > size:
-            raise ConfigError(f"noise_grid must be at most {size}, the action grid, got {self.noise_grid}")
+        if self.noise_grid > resolution:
+            raise ConfigError(f"noise_grid must be at most {resolution}, the action grid, got {self.noise_grid}")
 
 
 class CEMPlanner(Planner[CEMPlannerConfig]):
@@ -85,7 +78,6 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
     def _noise(self, plan: Tensor) -> Tensor:
         """Standard normal noise (T, B, P, 2, R, R), correlated in time; none for the first candidate."""
         (steps, batch, _, _, size), config = plan.shape, self.config
-        config.check_grid(size)
         shape = (steps, batch, config.candidates, 2, config.noise_grid, config.noise_grid)
         noise = torch.randn(shape, generator=self.generator, dtype=plan.dtype)
         noise[:, :, 0] = 0.0

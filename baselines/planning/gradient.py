@@ -22,9 +22,9 @@ class GradientPlannerConfig(PlannerConfig):
     clip: float = 3.0
     """Clip the gradient of a control step to this multiple of the median norm over the steps of the plan."""
 
-    def check_planner(self) -> None:
+    def check_planner(self, resolution: int) -> None:
         """Check what the types do not express."""
-        super().check_planner()
+        super().check_planner(resolution)
         check_positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 
 

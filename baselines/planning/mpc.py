@@ -1,6 +1,6 @@
 """Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,12 +12,17 @@ from baselines.common.open_loop import OpenLoop, OpenLoopLearner
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
-from baselines.planning.surrogate import Surrogate
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.learner import Scalars, Sees
 from cfp.presets import sac_preset
-from dittogym import make_spec
+from dittogym import TorchEnv, make_spec
+from dittogym.core import EnvState
+from dittogym.physics import PER_PARTICLE
+from torchmpm import tree
+
+#: Nearest particles among which each particle looks for one that is not taken yet.
+NEIGHBOURS = 16
 
 #: Every scalar that ``MPC.update`` logs, and what it means.
 METRICS: dict[str, str] = {
@@ -47,7 +52,7 @@ class PlannedConfig(PlannerConfig, OptimisationConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_planner()
+        self.check_planner(self.resolution(1))
         if self.num_envs != 1:
             raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.num_envs}")
 
@@ -66,11 +71,6 @@ class CEMConfig(CEMPlannerConfig, PlannedConfig):
 
     algo: str = "cem"
     """Which algorithm."""
-
-    def check(self) -> None:
-        """Check what the types do not express."""
-        super().check()
-        self.check_grid(self.resolution(1))
 
 
 def planner_preset(task: str) -> tuple[GradientPlannerConfig, Grid]:
@@ -97,6 +97,65 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
         "train_particles": None if name == "quick" else "lite",
         "train_dt": long_dt(task),
     }
+
+
+class Surrogate:
+    """Copies the states of one environment into another of the same task, with as many particles or fewer.
+
+    Each particle of the small environment stands for the nearest of the large in the initial positions of both, and
+    takes over its position, velocity and deformation; masses and volumes are the small environment's own.
+    """
+
+    def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
+        self.env = small
+        self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
+        same = large.model.camera.counts == small.model.camera.counts
+        own = {} if same else small.env_state.task_state
+        # Numbers of particles, such as those of the tip in GROW, see `dittogym.Reward`.
+        self._particle_state = {
+            name: value for name, value in own.items() if value.dtype == torch.int64 and value.ndim == 2
+        }
+
+    def sync(self, state: EnvState) -> None:
+        """Bring the small environment to a state of the large one."""
+
+        def select(value: Tensor) -> Tensor:
+            return value[torch.arange(len(value), device=value.device)[:, None], self.indices]
+
+        physics = {
+            name: select(value) if name in PER_PARTICLE and value.ndim == 2 else value
+            for name, value in state.physics.items()
+        }
+        task_state = {**state.task_state, **self._particle_state}
+        self.env.env_state = replace(
+            state, particles=tree.map(select, state.particles), physics=physics, task_state=task_state
+        )
+
+
+def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:
+    """Indices (B, n) of the large environment's nearest particles, body by body, each at most once."""
+    if torch.equal(large.state.x, small.state.x):
+        return torch.arange(large.num_particles, device=large.device).expand(large.num_envs, -1)
+    indices, start, small_start = [], 0, 0
+    for many, few in zip(large.model.solver.bodies, small.model.solver.bodies, strict=True):
+        if few.count > many.count:
+            raise ConfigError(f"train_particles of a body must be at most {many.count}, got {few.count}")
+        x = large.state.x[:, start : start + many.count].detach()
+        small_x = small.state.x[:, small_start : small_start + few.count].detach()
+        nearest = torch.cdist(small_x, x).topk(min(NEIGHBOURS, many.count), largest=False).indices
+        indices.append(torch.stack([_assign(rows, many.count) for rows in nearest.cpu()]) + start)
+        start, small_start = start + many.count, small_start + few.count
+    return torch.cat(indices, 1).to(large.device)
+
+
+def _assign(nearest: Tensor, count: int) -> Tensor:
+    """The first index of each row (n, k) that no earlier row has, or any free one where all are taken."""
+    free, assigned = set(range(count)), []
+    for row in nearest.tolist():
+        index = next((index for index in row if index in free), None)
+        assigned.append(min(free) if index is None else index)
+        free.remove(assigned[-1])
+    return torch.tensor(assigned)
 
 
 class MPC(OpenLoopLearner):

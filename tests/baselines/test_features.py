@@ -1,17 +1,19 @@
 """What a policy that sees the state is given, and what it is trained on."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from cfp.analytic.features import CELLS, StateFeatures
-from cfp.analytic.reward import RADIUS, TOLERANCE, Neighbours, RewardConfig, training_reward
+from baselines import Shac
+from cfp.analytic.critic import CELLS, StateFeatures
+from cfp.analytic.reward import RADIUS, TOLERANCE, Neighbours, training_reward
 from dittogym import TorchEnv
 
 
-def reset(task="run", count=500, envs=1):
-    env = TorchEnv(task, envs, particles=count, substeps=10, dtype="float64")
+def reset(task="run", count=500):
+    env = TorchEnv(task, particles=count, substeps=10, dtype="float64")
     env.reset(seed=0)
     return env
 
@@ -21,12 +23,10 @@ def rasters(env):
 
 
 def test_raster_holds_mass_momentum_and_deformation():
-    env = reset()
-    velocity = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    env, velocity = reset(), torch.tensor([0.3, -0.2], dtype=torch.float64)
     env.state.v[:] = velocity
     picture = rasters(env)
-    assert picture.shape == (1, 7, CELLS, CELLS)
-    assert picture[0, 0].mean().item() == pytest.approx(1.0)
+    assert picture.shape == (1, 7, CELLS, CELLS) and picture[0, 0].mean().item() == pytest.approx(1.0)
     assert torch.allclose(picture[0, 1:3], velocity[:, None, None] * picture[0, :1])
     assert picture[0, 3:].abs().max() == 0
 
@@ -41,22 +41,20 @@ def test_first_index_of_the_raster_is_along_x():
     env.state.x[..., 0] += 0.1
     moved = rasters(env)[0, 0]
     along = torch.arange(CELLS, dtype=torch.float64) + 0.5
-    patch = env.spec.patch / env.model.solver.grid.resolution
     place = (moved.sum(1) * along).sum() / moved.sum() - CELLS / 2
+    patch = env.spec.patch / env.model.solver.grid.resolution
     assert place.item() == pytest.approx(0.1 / patch * CELLS, abs=1e-6)
     assert (moved.sum(0) * along).sum() / moved.sum() < CELLS / 2
 
 
 def test_object_clock_and_place_are_added():
-    env = reset("kick")
-    features = StateFeatures(displacement=True)
-    seen = features(env)
-    assert seen.shape == (1, features.size(1)) == (1, 10 * CELLS**2 + 6 + 2)
-    assert seen[0, -8:].tolist() == pytest.approx([1, 1, 1, 0, 0, 0, 0, 0])
+    env, features = reset("kick"), StateFeatures(displacement=True)
+    row = features(env)
+    assert row.shape == (1, features.size(1)) == (1, 10 * CELLS**2 + 6 + 2)
+    assert row[0, -8:].tolist() == pytest.approx([1, 1, 1, 0, 0, 0, 0, 0])
     env.step(torch.zeros(1, 2, 8, 8))
-    clock = features(env)[0, -8:-2].tolist()
     angles = [2 * math.pi / period for period in (8, 4, 2)]
-    assert clock == pytest.approx([*map(math.cos, angles), *map(math.sin, angles)], abs=1e-6)
+    assert features(env)[0, -8:-2].tolist() == pytest.approx([*map(math.cos, angles), *map(math.sin, angles)], abs=1e-6)
 
 
 def test_integrity_counts_what_drifts_apart():
@@ -68,9 +66,8 @@ def test_integrity_counts_what_drifts_apart():
     torn[:, 6:, 0] += 0.05
     counted = (neighbours.distance < RADIUS).sum()
     crossing = ((neighbours.neighbours > 5) != (torch.arange(11)[:, None] > 5)) & neighbours.is_close
-    assert neighbours.drift(torn).item() == pytest.approx(
-        (crossing.sum() / counted * (0.05 / RADIUS - TOLERANCE) ** 2).item()
-    )
+    wanted = crossing.sum() / counted * (0.05 / RADIUS - TOLERANCE) ** 2
+    assert neighbours.drift(torn).item() == pytest.approx(wanted.item())
 
 
 def test_speed_is_what_is_paid_for():
@@ -78,11 +75,13 @@ def test_speed_is_what_is_paid_for():
     neighbours, before = Neighbours.find(env.state.x), env.env_state.centre
     env.state.v[..., 0] = 0.5
     _, smooth, _, _, info = env.step(torch.zeros(1, 2, 8, 8), soft=True)
-    config = RewardConfig("speed", split_weight=0.0, integrity_weight=0.0, scale=1.0)
-    paid = training_reward(config, env, before, smooth, info, neighbours)
-    assert paid.item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
-    assert paid.item() == pytest.approx(30, rel=0.05)
-    assert training_reward(RewardConfig("task", 0.0, 1.0, 0.0, 1.0), env, before, smooth, info, neighbours) == smooth
-    margin = RewardConfig("task", 1000.0, 0.5, 0.0, 1.0)
-    lost = smooth - training_reward(margin, env, before, smooth, info, neighbours)
+    plain = replace(Shac.preset("run", "quick"), split_weight=0.0, integrity_weight=0.0, reward_scale=1.0)
+
+    def paid(**changes):
+        return training_reward(replace(plain, **changes), env, before, smooth, info, neighbours)
+
+    assert paid(reward="speed").item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
+    assert paid(reward="speed").item() == pytest.approx(30, rel=0.05)
+    assert paid(reward="task") == smooth
+    lost = smooth - paid(reward="task", split_weight=1000.0, split_margin=0.5)
     assert lost.item() == pytest.approx(1000 * (info["split"].item() / env.spec.split_limit - 0.5) ** 2)
