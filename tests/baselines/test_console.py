@@ -45,20 +45,13 @@ def test_every_program_is_started_under_its_name_with_examples(name, capsys):
     assert ("--learner" in text) == (name == "train") and ("--td-lambda" in text) == name.startswith("train")
 
 
-@pytest.mark.parametrize(
-    ("words", "basic"),
-    [
-        ("train", "task target algo preset learner steps seed device out resume"),
-        ("distill", "task target algo preset steps seed device out resume"),
-    ],
-)
-def test_help_shows_basic_options_first(words, basic, capsys):
-    _, text, _ = output_of(capsys, words, "--help")
-    first, _, advanced = text.partition("advanced")
-    shown = re.findall(r"^[│ ] --([a-z-]+)", first, re.MULTILINE)
-    assert shown == basic.split()
-    assert "--dry-run" in advanced and not set(re.findall(r"^[│ ] --([a-z-]+)", advanced, re.MULTILINE)) & set(shown)
-    assert "Environment steps" in first and "Only " in advanced  # with their descriptions
+def test_help_shows_what_is_trained_first_and_the_task_s_own_values(capsys):
+    _, text, _ = output_of(capsys, "train", "--task", "kick", "--help")
+    shown = re.findall(r"^[│ ] --([a-z-]+)", text, re.MULTILINE)
+    assert len(set(shown)) == len(shown)
+    position = {name: shown.index(name) for name in ("task", "algo", "preset", "seed", "num-envs", "eval-every")}
+    assert sorted(position, key=position.__getitem__) == list(position)
+    assert "41600" in text and "Environment steps" in text
 
 
 def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys):
@@ -75,7 +68,7 @@ def test_train_takes_the_algorithm_from_a_file_and_its_default_from_cfp(tmp_path
     assert code == 0 and json.loads(text)["algo"] == "cem"
     _, text, _ = output_of(capsys, "train", "--task", "run", "--dry-run")
     _, also, _ = output_of(capsys, "train", "--task", "run", "--preset", "long", "--dry-run")
-    assert [json.loads(each)["learner"] for each in (text, also)] == ["analytic", "sac"]
+    assert [json.loads(each)["algo"] for each in (text, also)] == ["cfp-analytic", "cfp-sac"]
 
 
 def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):

@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from baselines.leaderboard import COUNTS, ENVIRONMENT, SEEDS, TASKS, main, ranki
 from cfp.agent.actor import build_actor
 from cfp.config import EVALUATION_SEED, LARGEST_SEED
 from cfp.errors import ConfigError
-from cfp.evaluation.returns import REFERENCE_RETURNS
-from cfp.files import read_json, write_json
+from cfp.files import write_json
 from cfp.policy import SHIPPED, shipped
 from cfp.presets import preset
 
@@ -173,8 +171,3 @@ def test_committed_results_are_those_of_the_package():
         assert row["sha256"] == hashlib.sha256((SHIPPED / f"{row['task']}.safetensors").read_bytes()).hexdigest()
         cost = costs[row["task"]]
         assert row["training"] == {"steps": int(cost["steps"]), "minutes": float(cost["minutes"])}
-    table = read_json(REFERENCE_RETURNS)
-    for row in results:
-        if row["policy"] != "pretrained":  # what every evaluation shows beside a policy
-            assert table[row["task"]][row["policy"]] == row["returns"] and not any(row["successes"])
-    assert json.dumps(sorted(table)) == json.dumps(sorted(TASKS))

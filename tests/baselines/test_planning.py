@@ -192,7 +192,7 @@ def test_a_search_without_any_finite_gradient_warns(monkeypatch):
 
 def test_spread_near_the_limit_costs():
     env = small("run")
-    plan, spread = torch.zeros(1, 1, *env.action_shape), float(env.env_state.start.split)
+    plan, spread = torch.zeros(1, 1, *env.action_shape), float(env.env_state.start.radius_of_gyration)
     for stretch in (1.0, 0.094 / spread):
         env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
         free, charged = (
@@ -346,7 +346,7 @@ def test_surrogate_takes_over_constants_and_memory_but_for_numbers_of_particles(
     own = torch.linspace(300.0, 600.0, large.num_particles).expand(2, -1)
     large.reset(seed=0, options={"physics": {"mu": own, "gravity": torch.tensor([0.0, -5.0])}})
     phase = torch.tensor([3, 4])
-    surrogate.sync(replace(large.env_state, memory={**large.env_state.task_state, "phase": phase}))
+    surrogate.sync(replace(large.env_state, task_state={**large.env_state.task_state, "phase": phase}))
     physics, memory = cheap.env_state.physics, cheap.env_state.task_state
     assert torch.equal(physics["mu"][1], own[1][surrogate.indices[1]]) and physics["gravity"].shape == (2, 2)
     assert torch.equal(memory["tip"], tip) and torch.equal(memory["phase"], phase)
