@@ -293,7 +293,7 @@ def test_presets_are_valid_survive_json_and_agree(task, preset):
         if name in ("coarse", "fine"):
             assert config.resolutions == (own.resolutions[0 if name == "coarse" else -1],)
             with pytest.raises(ConfigError, match="resolutions"):
-                find(name).begin(own, None)
+                configure(values | {"resolutions": [4, 8], "handover": [0.5]}).check()
 
 
 ACTIONS = torch.arange(3 * 2 * 4 * 4).reshape(3, 2, 4, 4) / 100.0
