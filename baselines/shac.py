@@ -271,18 +271,11 @@ class Shac(Resumable, UpdateLoop, Learner):
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Any]:
         """Act, see stable-baselines3's ``predict``; a policy of the state acts on the present one of the simulation."""
         policy = self.trained_policy
         acting = policy.attached(self.simulation) if isinstance(policy, StatePolicy) else policy
-        assert isinstance(observation, np.ndarray)
-        return acting.predict(observation, state, episode_start, deterministic)
+        return acting.predict(observation, *args, **kwargs)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor_adam", "critic.adam"], []

@@ -389,16 +389,9 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         descend(self.adam, self.config.max_grad_norm, "student's loss")
         return value
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Any]:
         """Act, see stable-baselines3's ``predict``; actions are enlarged to the grid of the algorithm's environment."""
-        assert isinstance(observation, np.ndarray)
-        actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
+        actions, state = self.trained_policy.predict(observation, *args, **kwargs)
         patch = self.config.make_spec().patch
         return project(torch.from_numpy(actions), patch, patch).numpy(), state
 

@@ -284,8 +284,15 @@ def test_presets_are_valid_survive_json_and_agree(task, preset):
             assert config.eval_deterministic == own.eval_deterministic, name
         if isinstance(config, type(own)) or name.startswith(("gnn", "transformer")):
             assert (config.environment, config.steps, config.gamma) == (own.environment, own.steps, own.gamma)
+            wanted, found = (each.hyperparameters(1) for each in (own, config))
+            for option in ("alpha", "random_steps"):
+                assert getattr(found, option) == getattr(wanted, option), option
+            most = wanted.actor_start if name in LEVELS else 800
+            assert found.actor_start == min(most, wanted.actor_start)
         if name in ("coarse", "fine"):
             assert config.resolutions == (own.resolutions[0 if name == "coarse" else -1],)
+            with pytest.raises(ConfigError, match="resolutions"):
+                configure(values | {"resolutions": [4, 8], "handover": [0.5]}).check()
 
 
 ACTIONS = torch.arange(3 * 2 * 4 * 4).reshape(3, 2, 4, 4) / 100.0
