@@ -57,7 +57,7 @@ def rest(task, seed, particles):
 
 def test_the_protocol_never_changes():
     expected = {"num_envs": 1, "particles": "lite", "substeps": 100, "dt": 1e-4, "dtype": "float32", "resample": False}
-    expected |= {"action_layout": None, "target": None, "variant": None}
+    expected |= {"action_layout": "image", "target": None, "variant": None}
     assert {name: asdict(ENVIRONMENT)[name] for name in expected} == expected
     assert TASKS == ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
     assert SEEDS == range(3_000_000_000, 3_000_000_008)
@@ -78,7 +78,7 @@ def test_layouts_of_a_task_differ_unless_it_draws_no_positions(task):
 
 
 def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
-    config = replace(preset("shapematch", "quick"), environment=replace(tiny, action_layout="grid"))
+    config = replace(preset("shapematch", "quick"), **vars(tiny) | {"action_layout": "grid"})
     save_actor(tmp_path / "my policy.safetensors", build_actor(config.actor_spec(1)), config, 1, 1234)
     policies = [str(tmp_path / "my policy.safetensors"), "zero"]
     assert main([*policies, "--tasks", "shapematch", "--out", str(tmp_path / "out")]) == 0
@@ -107,7 +107,7 @@ def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path):
 def test_policies_of_other_tasks_are_refused(tmp_path, capsys):
     config = preset("shapematch", "quick")
     for changes, expected in (({"target": "T"}, "target of the task, got T"), ({"substeps": 50}, "got 0.005")):
-        there = replace(config, environment=replace(config.environment, **changes))
+        there = replace(config, **changes)
         save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
         assert main([str(tmp_path / "a.safetensors"), "--out", str(tmp_path / "out")]) == 2
         assert expected in capsys.readouterr().err
