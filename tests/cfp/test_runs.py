@@ -17,24 +17,10 @@ pytestmark = pytest.mark.usefixtures("short")
 
 #: The options of `tiny_runs.TINY`.
 OPTIONS = {
-    "learner": "sac",
-    "particles": 100,
-    "substeps": 1,
-    "num_envs": 2,
-    "resolutions": (4, 8),
-    "handover": [70],
-    "random_steps": (10, 4),
-    "batch_size": 4,
-    "buffer_size": 60,
-    "update_start": 8,
-    "actor_start": 0,
-    "gradient_steps": 1,
-    "eval_every": 60,
-    "eval_episodes": 2,
-    "checkpoint_every": 20,
-    "log_every": 10,
-    "video": False,
-    "device": "cpu",
+    **{"algo": "cfp-sac", "particles": 100, "substeps": 1, "num_envs": 2, "resolutions": (4, 8), "handover": [0.4667]},
+    **{"random_steps": (10, 4), "batch_size": 4, "buffer_size": 60, "update_start": 8, "critics_first": (0.0,)},
+    **{"gradient_steps": 1, "eval_every": 60, "eval_episodes": 2, "checkpoint_every": 20, "log_every": 10},
+    **{"video": False, "device": "cpu"},
 }
 
 
@@ -94,11 +80,12 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
     [
         ({"gama": 0.9}, "gama is not an option of this run; did you mean gamma"),
         ({"environment": {"particles": 100}}, "environment is not an option .* --help lists them"),
-        ({"particles": "few"}, "particles must be 'full' or 'lite' or an integer .* got 'few'"),
+        ({"particles": "few"}, "particles must be of type .* got 'few'"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
-        ({"handover": (10, 20)}, "handover must have 1 values"),
-        ({"steps": 96, "num_envs": 2, "window": 32, "handover": (48,)}, "every stage at least 64 steps"),
-        ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the learner sac only
+        ({"handover": (10, 20)}, "handover must be shares"),
+        ({"handover": ()}, "handover must have 1 values"),
+        ({"steps": 96, "num_envs": 2, "window": 32, "handover": (0.5,)}, "every stage at least 64 steps"),
+        ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the other learner only
         ({"refine": True}, "refine requires start_from"),
         ({"warmup": 3, "task": "nowhere"}, "task must be .* got 'nowhere'"),
         ({"out": ""}, "out must be the path of a folder, got ''"),

@@ -426,6 +426,17 @@ def test_the_critics_alone_train_the_shared_encoder(spec):
     assert all(not actor.get_parameter(name).requires_grad for name in coarse)
 
 
+def test_encoder_of_a_refined_policy_stays():
+    model = make_model(LEAN["plain"], FakeEnv(num_envs=2, resolution=8))
+    actor = model.networks()[0]
+    model.trains_encoder = False
+    before = {name: value.clone() for name, value in actor.state_dict().items()}
+    model.update(make_batch(8))
+    same = {name: torch.equal(value, before[name]) for name, value in actor.state_dict().items()}
+    assert all(same[name] for name in same if name.startswith("encoder."))
+    assert not any(same[name] for name in same if name.startswith("mean."))
+
+
 def test_average_of_weights_is_the_policy():
     model = make_model(LEAN["plain"], FakeEnv(num_envs=2, resolution=8), weight_average=0.9)
     expected = {name: value.clone() for name, value in model.networks()[0].state_dict().items()}
