@@ -1,6 +1,5 @@
 """Training from Python is training from the command line."""
 
-import json
 import signal
 from pathlib import Path
 
@@ -9,9 +8,7 @@ from short_episodes import HORIZON
 from tiny_runs import assert_same_run, at_step
 
 import cfp
-from cfp import evaluate
 from cfp.weights import read_policy
-from dittogym.trajectories import load_episodes
 
 pytestmark = pytest.mark.usefixtures("short")
 
@@ -45,22 +42,6 @@ def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
         run.film(tmp_path / "film.doc")
     with pytest.raises(cfp.CheckpointError, match="no run"):
         cfp.Run(tmp_path)
-
-
-@pytest.mark.parametrize("noise", ["default", "without"])
-def test_recorded_episodes_are_those_that_were_evaluated(finished, tmp_path, noise, capsys):
-    file = tmp_path / "episodes.npz"
-    options = f"--episodes 2 --json --noise {noise} --record {file} --record-fields x".split()
-    assert evaluate.main([str(finished), *options]) == 0
-    told = capsys.readouterr()
-    episodes = load_episodes(file)
-    assert [episode.rewards.sum() for episode in episodes] == pytest.approx(
-        json.loads(told.out)[-1]["returns"], abs=2e-3
-    )
-    assert [list(episode.particles) for episode in episodes] == [["x"], ["x"]] and f"record: {file}" in told.err
-    assert episodes[0].seed + 1 == episodes[1].seed and episodes[0].actions.shape == (HORIZON, 2, 64, 64)
-    assert evaluate.main([str(finished), "--record", str(tmp_path / "episodes.h5")]) == 2
-    assert "record must end in .npz, got" in capsys.readouterr().err
 
 
 def test_unfinished_run_has_no_results(finished, tmp_path):

@@ -41,7 +41,7 @@ def make(algorithm):
         own = Hyperparameters(buffer_size=40, batch_size=4, update_start=6, random_steps=4, weight_average=0.9)
         return CFP("CFPPolicy", make_env(), own, seed=0, device="cpu")
     own = {SAC: {"learning_starts": 4, "buffer_size": 20}, PPO: {"n_steps": 4, "n_epochs": 1}}[algorithm]
-    return algorithm("CnnPolicy", make_env(), policy_kwargs=FEATURES, seed=0, device="cpu", batch_size=4, **own)
+    return algorithm("CnnPolicy", make_env(), policy_kwargs=dict(FEATURES), seed=0, device="cpu", batch_size=4, **own)
 
 
 @pytest.mark.parametrize("algorithm", [CFP, CFPAnalytic, SAC, PPO])
