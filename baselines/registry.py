@@ -46,7 +46,7 @@ def sees(name: str) -> Sees:
 
 def configure(values: dict[str, Any]) -> RunConfig:
     """Options from JSON values, also those of reference policies; see `cfp.registry.configure`."""
-    if values.get("algo") not in REFERENCE_POLICIES:
+    if str(values.get("algo")) not in REFERENCE_POLICIES:
         return registry.configure(values)
     base = reference_preset(values["algo"], values.get("task", DEFAULT_TASK), values.get("preset", "quick"))
     return update_from_dict(base, values)
