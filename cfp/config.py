@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
 
-from typeguard import TypeCheckError, check_type
+from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 import dittogym.tasks
 from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
@@ -55,8 +55,7 @@ class EnvironmentConfig:
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: str | None = None
-    """For tasks that have variants: in SLOT the material, that of the registered environment (registered, also None) or
-    of the published training run (published)."""
+    """For SLOT the material: registered (of the registered environment; None too) or published (of the training)."""
 
     def task_options(self) -> dict[str, Any]:
         """The options that belong to the task, for `dittogym.make_spec`."""
@@ -77,8 +76,7 @@ class TaskConfig:
     algo: str
     """Name of the algorithm."""
     preset: Preset = "quick"
-    """Set of default options: quick (minutes), paper (the published values), or long (a night; only for algorithms that
-    learn by soft actor-critic)."""
+    """Set of default options: quick (minutes), long (a night; soft actor-critic only), or paper (published values)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -277,8 +275,7 @@ class CoarseToFineConfig(StagedConfig):
     """A run of the coarse-to-fine policy, which may begin with a trained one."""
 
     start_from: str | None = None
-    """Policy of the first stages (a run folder, policy.safetensors, the name of one that comes with the package, or
-    hf://OWNER/NAME): training begins with the stage after it."""
+    """Policy to begin after: a run folder, a file, the name of one that comes with the package, or hf://OWNER/NAME."""
     refine: bool = False
     """Continue to train the last stage of start_from instead."""
 
@@ -386,8 +383,7 @@ class SACConfig(LearningConfig, CoarseToFineConfig):
     noise_scale: tuple[float, float] = (0.05, 0.4)
     """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
     max_episode_steps: int | None = None
-    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
-    different ages. None: the horizon, and all begin together."""
+    """Steps after which training episodes end, the first ones earlier; None: the horizon, and all begin together."""
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
@@ -441,26 +437,21 @@ class WindowConfig(RunConfig):
     max_grad_norm: float = 1.0
     """Largest norm of a gradient of the networks, of actor and critic each."""
     max_episode_steps: int = 400
-    """Control steps after which a training episode is truncated, if the task's horizon is not shorter; the first ones
-    are truncated at staggered ages."""
+    """Control steps after which training episodes end, the first ones earlier; at most the task's horizon."""
     num_layouts: int = 16
     """Particle layouts that training episodes start from in turn."""
     reward: Literal["task", "speed"] = "task"
-    """Training reward. task: the task's own, made smooth; speed: 60 per m/s to the right, less the task's cost of
-    action."""
+    """Training reward: task (its own, made smooth) or speed (60 per m/s to the right, less the cost of action)."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
-    exceeds split_margin."""
+    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin."""
     split_margin: float = 0.85
     """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
     integrity_weight: float = 300.0
-    """Weight of the cost of particles that were neighbours at the start of the window, or of the episode within it, and
-    drift apart."""
+    """Weight of the cost of neighbouring particles that drift apart within a window."""
     reward_scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward per step, discounted, as if the episode went on after it ended in success, for 1 / (1 - gamma) steps,
-    at most 100; 0: none, as in the task."""
+    """Reward per step after success, as if the episode went on for 1 / (1 - gamma) steps, at most 100; 0: none."""
 
     def for_training(self: Config) -> Config:
         """These options, with the environment that is trained in."""
@@ -470,6 +461,8 @@ class WindowConfig(RunConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        if self.resample:
+            raise ConfigError(f"resample must be False for {self.algo}, got True; num_layouts says how many are drawn")
         check_at_least(1, window=self.window, critic_updates=self.critic_updates)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
@@ -481,7 +474,7 @@ class WindowConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnalyticConfig(CoarseToFineConfig, WindowConfig):
+class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     """A run of the coarse-to-fine policy that learns by gradients through the simulation."""
 
     algo: str = "cfp-analytic"
@@ -566,17 +559,19 @@ def update_from_dict(base: Options, values: Any) -> Options:
     for name, value in values.items():
         if name not in names:
             raise ConfigError(f"{name} is not an option; options are {', '.join(names)}")
-        value = tuple(value) if isinstance(value, list) else value
+        hint, value = hints[name], tuple(value) if isinstance(value, list) else value
+        parts = value if isinstance(value, tuple) else (value,)
         try:
-            if isinstance(value, bool) and hints[name] is not bool:  # which Python takes for a number
+            if hint is not bool and any(isinstance(part, bool) for part in parts):  # which Python takes for numbers
                 raise TypeCheckError("is a truth value")
-            check_type(value, hints[name])
+            check_type(value, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
         except TypeCheckError as error:
-            expected = getattr(hints[name], "__name__", str(hints[name]).replace("typing.", ""))
+            expected = hint.__name__ if type(hint) is type else str(hint).replace("typing.", "")
             raise ConfigError(f"{name} must be of type {expected}, got {brief(value)}") from error
-        if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise ConfigError(f"{name} must be below 2**63, got a number of {len(str(value))} digits")
-        changes[name] = float(value) if hints[name] is float and isinstance(value, int) else value
+        for part in parts:
+            if isinstance(part, int) and not -(2**63) <= part < 2**63:
+                raise ConfigError(f"{name} must be below 2**63, got a number of {len(str(part))} digits")
+        changes[name] = float(parts[0]) if hint is float else value
     return replace(base, **changes)
 
 

@@ -212,11 +212,12 @@ class UpdateLoop(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> UpdateLoop:
         """Take at least ``total_timesteps`` environment steps, see stable-baselines3; rows are logged by update."""
+        resets = reset_num_timesteps or self._last_obs is None  # as `_setup_learn` does
         total, self._callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        if reset_num_timesteps:
-            self.begin_episodes()  # `_setup_learn` has reset the environment
+        if resets:
+            self.begin_episodes()
         self._callback.on_training_start(locals(), globals())
         updates = 0
         while self.num_timesteps < total:

@@ -66,12 +66,13 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         self.regression = Regression(self.actor, config.learning_rate, config.weight_average, config.max_grad_norm)
         self.features = StateFeatures(displacement=config.displacement)
         with seeded(config.seed):
-            critic = mlp(self.features.size(len(self.simulation.spec.bodies) - 1), 1).to(self.simulation.device)
+            critic = mlp(self.features.size(len(config.make_spec().bodies) - 1), 1).to(self.device)
         self.critic = Critic(critic, config)
         networks = {"learned": self.actor, "value": critic, "target": self.critic.target}
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.trained_actor, **networks)
         self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
-        self.begin_episodes()
+        if self.env is not None:  # a loaded model can act without one
+            self.begin_episodes()
 
     def begin_episodes(self) -> None:
         """Start new episodes in all elements of the simulation."""

@@ -59,25 +59,28 @@ def program_name(module: str, arguments: Sequence[str] | None) -> str:
     return f"python {sys.argv[0]}" if own else f"python -m {module}"
 
 
-def with_examples(about: str, program: str, *examples: str) -> str:
-    """The description of a ``program`` for its help, followed by ``examples`` of its options."""
-    lines = "\n".join(f"  {program} {example}" for example in examples)
-    return f"{inspect.cleandoc(about)}\n\nExamples:\n{lines}"
-
-
 def read_command(
     kind: Callable[..., Command],
     module: str,
     examples: Sequence[str],
     args: Sequence[str] | None,
     started: str | None = None,
+    about: str | None = None,
     **options: Any,
 ) -> Command:
-    """Read the command line of ``python -m MODULE`` into a dataclass; ``options`` are further ones of `tyro.cli`.
+    """Read the command line of ``python -m MODULE`` into a dataclass; options of nested ones have no prefix.
 
-    Options of nested dataclasses have no prefix.
+    Args:
+        kind: The dataclass; its docstring is the description, unless ``about`` is given.
+        module: What was started.
+        examples: Of its options, for the help.
+        args: The command line; None: the program's own.
+        started: How the program was started, if not as `program_name` says.
+        about: Description for the help.
+        options: Further ones of `tyro.cli`.
     """
     program = started or program_name(module, args)
-    about = with_examples(kind.__doc__ or "", program, *examples)
+    lines = "\n".join(f"  {program} {example}" for example in examples)
+    about = f"{inspect.cleandoc(about or kind.__doc__ or '')}\n\nExamples:\n{lines}"
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     return tyro.cli(kind, prog=program, description=about, args=args, config=config, **options)

@@ -30,11 +30,12 @@ def parse_folder(words: list[str]) -> Path:
     return Path(word)
 
 
-def _parse_option(words: list[str]) -> Path:
+def folder_option(words: list[str]) -> Path:
+    """The folder that ``--out`` names; a `ConfigError` if it cannot be the name of one."""
     try:
         return parse_folder(words)
     except ValueError as error:  # which tyro would bury under its own words
-        raise CFPError(f"out {error}") from error
+        raise ConfigError(f"out {error}") from error
 
 
 #: A folder to write into, as an option of a command line.
@@ -43,7 +44,7 @@ Folder = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=_parse_option,
+        instance_from_str=folder_option,
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda folder: [str(folder)],
     ),

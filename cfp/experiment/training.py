@@ -5,31 +5,35 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import inspect
 import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
+import dittogym
 from cfp import registry
 from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, read_command, run_command
-from cfp.experiment.folder import Folder, holds_run, parse_folder, read_config, run_lock
+from cfp.experiment.folder import Folder, folder_option, holds_run, read_config, run_lock
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 
+#: How the coarse-to-fine policy learns.
+Learner: TypeAlias = Literal["analytic", "sac"]
 EXAMPLES = (
     "--task run",
     "--task shapematch --target M --seed 1 --out runs/M",
-    "--task run --algo cfp-sac --dry-run",
+    "--task run --learner sac --dry-run",
     "--resume --out runs/M",
 )
-#: Options that choose the defaults of all others.
-DECISIVE = ("algo", "task", "preset", "start_from", "refine")
+#: Options that choose the defaults of all others, and the folder.
+DECISIVE = ("algo", "task", "preset", "seed", "start_from", "refine")
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class Command:
     """
 
     run: RunConfig
+    learner: Learner | None = None
+    """How the coarse-to-fine policy learns: short for --algo cfp-analytic and --algo cfp-sac."""
     out: Folder | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
@@ -56,29 +62,23 @@ class Command:
 def parse(words: Sequence[str], module: str = "cfp.train", started: str | None = None) -> Command:
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("algo", "task", "preset", "start-from", "learner", "out", "config"):
-        scan.add_argument(f"--{name}", f"--{name.replace('-', '_')}")
+    for name in ("algo", "task", "preset", "seed", "start-from", "learner", "out", "config"):
+        scan.add_argument(f"--{name}", f"--{name.replace('-', '_')}", nargs="?")  # what lacks a value is refused below
     for name in ("refine", "resume"):
         scan.add_argument(f"--{name}", action="store_true")
     first, _ = scan.parse_known_args(words)
-    words = list(words)
-    if first.learner is not None:  # the short way to name an algorithm
-        words = _without(words, "--learner")
-        if first.algo is None:
-            first.algo = f"cfp-{first.learner}"
-            words += ["--algo", first.algo]
+    if first.algo is None and first.learner in get_args(Learner):
+        first.algo = f"cfp-{first.learner}"
+    try:
+        first.seed = None if first.seed is None else int(first.seed)
+    except ValueError:
+        first.seed = None  # which is refused below
     values = _read_file(first.config)
     values |= {name: value for name in DECISIVE if (value := getattr(first, name)) not in (None, False)}
-    named = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
-    defaults, out = _defaults(values, None if first.out is None else parse_folder([first.out]), first.resume, named)
-    command = read_command(
-        Command,
-        module,
-        EXAMPLES,
-        words,
-        started,
-        default=Command(defaults, out),
-    )
+    defaults, out = _defaults(values, None if first.out is None else folder_option([first.out]), first.resume)
+    algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}.\nTasks: {', '.join(dittogym.TASKS)}."
+    about = f"{inspect.cleandoc(Command.__doc__ or '')}\n\n{algorithms}"
+    command = read_command(Command, module, EXAMPLES, words, started, about, default=Command(defaults, out=out))
     return _complete(command)
 
 
@@ -95,27 +95,27 @@ def from_python(options: Mapping[str, Any], out: Path | None, resume: bool) -> C
             close = difflib.get_close_matches(name, known, 1)
             instead = f"did you mean {close[0]}?" if close else "torchmpm train --help lists them"
             raise ConfigError(f"{name} is not an option of this run; {instead}")
-    defaults, out = _defaults(values, out, resume, values)
-    return _complete(Command(defaults, out, resume))
+    defaults, out = _defaults(values, out, resume)
+    return _complete(Command(defaults, out=out, resume=resume))
 
 
-def _defaults(values: dict[str, Any], out: Path | None, resume: bool, named: Any) -> tuple[RunConfig, Path | None]:
+def _defaults(values: dict[str, Any], out: Path | None, resume: bool) -> tuple[RunConfig, Path | None]:
     """The options that ``values`` result in, those of the run that is resumed if there is one, and its folder."""
-    config = registry.configure(values)
-    if not resume:
-        return config, out
-    folder = out or Path("runs") / config.name
-    if not (folder / "config.json").exists():
-        if "task" not in values and "task" not in named:
+    if resume:
+        folder = out or Path("runs") / registry.configure(_decisive(values)).name
+        if (folder / "config.json").exists():
+            past = read_config(folder, registry.configure)
+            if values.get("algo", past.algo) != past.algo:
+                raise ConfigError(f"algo must be {past.algo!r}, that of the run in {folder}, got {values['algo']!r}")
+            return update_from_dict(past, values), folder  # a value that differs from the run's is refused later
+        if "task" not in values:
             raise ConfigError(f"out: {folder} holds no run to resume; name a --task to start one there")
-        return config, out
-    past = read_config(folder, registry.configure)
-    if values.get("algo", past.algo) != past.algo:
-        raise ConfigError(f"algo must be {past.algo!r}, that of the run in {folder}, got {values['algo']!r}")
-    return update_from_dict(past, values), folder  # a value that differs from the run's is refused later
+    return registry.configure(values), out
 
 
 def _complete(command: Command) -> Command:
+    if command.learner is not None and (algo := f"cfp-{command.learner}") != command.run.algo:
+        raise ConfigError(f"learner must not be given with another algo than {algo}, got {command.run.algo}")
     command.run.check()
     return replace(command, out=command.out or Path("runs") / command.run.name)
 
@@ -132,12 +132,6 @@ def _read_file(path: str | None) -> dict[str, Any]:
         return read_json(Path(path))
     except (OSError, ValueError) as error:
         raise ConfigError(f"config: {path} cannot be read as JSON ({error})") from error
-
-
-def _without(words: list[str], option: str) -> list[str]:
-    """A command line without an option and its value."""
-    index = next(i for i, word in enumerate(words) if word == option or word.startswith(f"{option}="))
-    return words[:index] + words[index + (1 if "=" in words[index] else 2) :]
 
 
 def main(arguments: Sequence[str] | None = None, module: str = "cfp.train", prefix: Sequence[str] = ()) -> int:

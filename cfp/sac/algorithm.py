@@ -167,10 +167,13 @@ class CFP(SAC):
 
     Attributes:
         average: The actor with averaged weights, see `restart_average`; None without ``weight_average``.
+        trains_encoder: Whether critics train an encoder that they share with the actor; False where a trained policy
+            is refined, which their first updates would change.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
     reward_statistics: RewardStatistics
+    trains_encoder: bool = True
 
     def __init__(
         self,
@@ -247,6 +250,8 @@ class CFP(SAC):
         """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
         assert isinstance(self.policy, NetworkPolicy)
         obs = self.policy.encode(batch.observations)
+        if not self.trains_encoder:
+            obs = obs.detach()
         with torch.no_grad():
             next_obs = self.policy.encode(batch.next_observations)
         scalars = self._update_critic(obs, next_obs, batch)

@@ -102,6 +102,7 @@ class CFPSAC(SACLearner, CoarseToFine):
         assert isinstance(learner, CFPSAC)
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.networks()[0])
         learner.restart_average()
+        learner.trains_encoder = not refines(config, folder, stage)
         return learner
 
     def images(self) -> dict[str, np.ndarray]:

@@ -29,7 +29,7 @@ SCALARS = (
     | st.integers()
     | st.floats()
     | st.text(max_size=8)
-    | st.sampled_from([2**63, 10**400, -1, 0, "run", "quick", "cfp", "../../x", "\x00"])
+    | st.sampled_from([2**63, 10**400, -1, 0, "run", "quick", "cfp-sac", "../../x", "\x00"])
 )
 JSON = st.recursive(
     SCALARS,
@@ -71,7 +71,7 @@ CHANGES = st.lists(st.tuples(st.integers(0, 4000), st.integers(0, 255)), max_siz
 CUTS = st.sampled_from([0, 0, 0, 1, 9, 500])
 
 
-@pytest.mark.parametrize("algo", ["cfp", "distill", "gradient", "shac"])
+@pytest.mark.parametrize("algo", ["cfp-analytic", "cfp-sac", "distill", "gradient", "shac"])
 @FUZZ
 @given(data=st.data())
 def test_options_of_any_kind(algo, data):

@@ -1,34 +1,66 @@
-"""The learner `analytic`, on robots of a few hundred particles."""
+"""The learner `CFPAnalytic`, on robots of a few hundred particles."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
 import cfp
 import dittogym
+from cfp import CFPAnalytic
 from cfp.agent.actor import ActorSpec, build_actor
 from cfp.analytic.action_step import ActionStep
-from cfp.analytic.config import WindowConfig
-from cfp.analytic.learner import METRICS, AnalyticLearner
+from cfp.analytic.learner import METRICS
 from cfp.analytic.regression import ImageMemory, Regression
-from cfp.analytic.reward import RewardConfig
 from cfp.analytic.window import WindowCollector, reward_warnings
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.config import WindowConfig
+from cfp.errors import NonFiniteError
 from cfp.experiment.folder import policy_path
 from cfp.policy import describe_run
-from cfp.sections import EnvironmentConfig
 from dittogym.rewards import Reward
 
 
 def make(task="run", stages=1, **changes):
-    environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
-    grids = (4, 8)[:stages]
-    defaults = {"resolutions": grids, "handover": (48,)[: stages - 1], "gate_bias": (-1.0,)[: stages - 1], "steps": 96}
-    defaults |= {"action_step": (0.1, 0.1)[:stages], "environment": environment, "train_particles": 300}
-    defaults |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3, "warmup": 0}
-    return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
+    options = {"resolutions": (4, 8)[:stages], "handover": (0.5,), "gate_bias": (-1.0,), "steps": 96, "warmup": 0}
+    options |= {"action_step": (0.1,), "num_envs": 2, "particles": 300, "train_particles": 300, "substeps": 4}
+    options |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3}
+    return replace(cfp.preset(task, "quick", "cfp-analytic"), **options | changes)
+
+
+class Rows(BaseCallback):
+    """Keeps what is recorded by each update."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows, self.window = [], False
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_start(self):
+        if self.window:
+            self.rows.append(dict(self.logger.name_to_value))
+        self.window = True
+
+    def _on_training_end(self):
+        self._on_rollout_start()
+
+
+def update(learner, count=1):
+    """Make some updates; returns what each records."""
+    rows = Rows()
+    steps = count * learner.config.update_every
+    learner.learn(steps, rows, log_interval=None, reset_num_timesteps=False)
+    return rows.rows
+
+
+def create(config, folder, stage=1):
+    learner = CFPAnalytic.create(config, stage, folder)
+    learner.set_logger(Logger(None, []))
+    return learner
 
 
 def counting(transition, spec):
@@ -38,9 +70,9 @@ def counting(transition, spec):
 def test_a_reward_without_gradient_is_noticed(monkeypatch):
     spec = replace(dittogym.make_spec("run"), name="count", reward_fn=counting, weights={"far": 1.0, "action": 1e-4})
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: spec)
-    config = make(reward=RewardConfig("task"))
+    config = make(reward="task")
     assert reward_warnings(config) == []
-    assert reward_warnings(replace(config, environment=replace(config.environment, dtype="float64"))) == []
+    assert reward_warnings(replace(config, dtype="float64")) == []
     assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
 
 
@@ -49,74 +81,47 @@ def without_derivative(transition, spec):
     return Reward({"far": (x - x.detach()).square().sqrt()})  # 0, and its derivative is NaN
 
 
-def test_gradients_that_are_never_finite_end_the_training(monkeypatch):
+def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path):
     spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=without_derivative, weights={"far": 1.0})
     monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
-    config = replace(make(reward=RewardConfig("task")), task="nan")
-    learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
-    for _ in range(9):
-        with pytest.warns(UserWarning, match="most gradients of a window are not finite"):
-            learner.update()
-    with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row are NaN, infinite or 0; a term of"):
-        learner.update()
+    learner = create(replace(make(reward="task"), task="nan"), tmp_path)
+    with pytest.warns(UserWarning, match="most gradients of a window are not finite"):
+        update(learner, 9)
+    with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row"):
+        update(learner)
 
 
-def test_can_train_with_longer_substeps_than_it_is_evaluated_with():
-    config = make(train_dt=2e-4)
-    for changed, expected in ((config, (2e-4, 2)), (replace(config, train_dt=None), (1e-4, 4))):
-        model = AnalyticLearner(changed, 1, build_actor(changed.actor_spec(1))).env.model
+def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
+    for train_dt, expected in ((2e-4, (2e-4, 2)), (None, (1e-4, 4))):
+        model = create(make(train_dt=train_dt), tmp_path).simulation.model
         assert (model.solver.dt, model.substeps) == expected
+
+
+def go_on(done, infos):
+    """Whether the training goes on after a step."""
+    return True
 
 
 def parameters(module):
     return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 
 
-def test_quick_learns_by_gradients_and_paper_from_rewards():
-    assert cfp.preset("run").learner == "analytic" and cfp.preset("run", "paper").learner == "sac"
-    assert cfp.preset("run", "quick", "sac").learner == "sac"
-    with pytest.raises(ConfigError, match="preset must be quick for learner analytic, got 'paper'"):
-        cfp.preset("run", "paper", "analytic")
-    with pytest.raises(ConfigError, match="learner must be analytic or sac, got 'ppo'"):
-        cfp.preset("run", "quick", "ppo")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"window": 0}, "window must be at least 1, got 0"),
-        ({"action_step": (0.0,)}, "action_step must be positive, got 0"),
-        ({"action_step": (0.1, 0.1)}, "action_step must have 1 values"),
-        ({"weight_average": 1.0}, "weight_average must be at least 0 and less than 1, got 1.0"),
-        ({"refine": True}, "refine requires start_from"),
-        ({"learner": "sac"}, "learner must be analytic for algo cfp, got sac"),
-    ],
-)
-def test_impossible_options_are_named(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        make(**changes).check()
-
-
 def test_training_shapes_the_robot(tmp_path):
     config = make("shapematch", resolutions=(8,), window=16, steps=448, max_episode_steps=48, num_layouts=2)
-    config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=16, windows_kept=4)
-    config = replace(config, environment=EnvironmentConfig(2, 300), train_particles=300)
-    learner, rewards = AnalyticLearner.create(config, 1, tmp_path), []
-    while learner.num_timesteps < config.steps:
-        scalars = learner.update()
-        rewards.append(scalars["train/true_reward"])
-    assert set(scalars) == set(METRICS)
+    config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=16, windows_kept=4, substeps=None)
+    rows = update(create(config, tmp_path), 14)
+    assert set(rows[-1]) == set(METRICS)
+    rewards = [row["train/true_reward"] for row in rows]
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.8  # 1.2 to 1.4 with three seeds
 
 
 @pytest.mark.cuda
 def test_trains_on_cuda_and_goes_on_on_the_cpu(tmp_path):
     config = make("shapematch", device="cuda")
-    learner = AnalyticLearner.create(config, 1, tmp_path)
-    learner.update()
-    there = AnalyticLearner.create(replace(config, device="cpu"), 1, tmp_path)
+    learner, there = create(config, tmp_path), create(replace(config, device="cpu"), tmp_path)
+    update(learner)
     there.load_state_dict(learner.state_dict())
-    assert np.isfinite(there.update()["train/reward"])
+    assert np.isfinite(update(there)[0]["train/reward"])
 
 
 def test_step_has_the_given_size_and_goes_down_the_gradient():
@@ -176,42 +181,42 @@ def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation(grid
 
 
 def test_rates_fall_along_a_line(tmp_path):
-    learner = AnalyticLearner.create(make(), 1, tmp_path)
+    learner = create(make(), tmp_path)
     config = learner.config
     learner.num_timesteps = config.steps // 2
-    scalars = learner.update()
+    scalars = update(learner)[0]
     assert scalars["train/learning_rate"] == pytest.approx(0.55 * config.learning_rate)
     assert scalars["train/action_step"] == pytest.approx(0.7 * config.action_step[0])
 
 
 def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):
-    first = AnalyticLearner.create(make(), 1, tmp_path)
-    first.learn(16)
+    first = create(make(), tmp_path)
+    update(first, 2)
     first.save_policy(policy_path(tmp_path, 1), describe_run(first.config, "cfp", 1, 16))
-    second = AnalyticLearner.create(make(stages=2), 2, tmp_path)
+    second = create(make(stages=2), tmp_path, 2)
     coarse, gate = (second.actor.get_submodule(name) for name in ("coarse", "gate"))
     assert second.starts_trained and torch.equal(parameters(coarse), parameters(first.trained_actor))
     before = parameters(gate)
-    second.learn(16)
+    update(second, 2)
     assert torch.equal(parameters(coarse), parameters(first.trained_actor))
     assert not torch.equal(before, parameters(gate))
     observation = np.zeros((3, 64, 64), np.uint8)
-    action, _ = second.policy.predict(observation, deterministic=True)
-    assert action.shape == (2, second.policy.resolution, second.policy.resolution)
+    for policy in (second, second.trained_policy):
+        assert policy.predict(observation, deterministic=True)[0].shape == second.action_space.shape
 
 
 def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
     """The step on the actions, were it small, increases the return of the same window."""
     config = make(substeps=100, gamma=1.0, num_envs=1)
-    learner = AnalyticLearner.create(config, 1, tmp_path)
-    env, collector = learner.env, learner.collector
+    learner = create(config, tmp_path)
+    env, collector = learner.simulation, learner.collector
     start = env.save()
     leaf = torch.randn(4, 1, *env.action_shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
 
     def window_return(actions):
         env.load(start)
         steps = iter(actions)
-        return collector.collect(lambda _: next(steps).tanh(), learner.critic).rewards.sum()
+        return collector.collect(lambda _: next(steps).tanh(), learner.critic, go_on).rewards.sum()
 
     before = window_return(leaf)
     (gradient,) = torch.autograd.grad(-before, leaf)
@@ -221,16 +226,14 @@ def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
     assert (after - before).item() == pytest.approx(expected.item(), rel=0.2) and after > before
 
 
-def test_a_trained_policy_is_kept_until_the_critic_has_learned():
-    config = make(warmup=2)
-    learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
+def test_a_trained_policy_is_kept_until_the_critic_has_learned(tmp_path):
+    learner = create(make(warmup=2), tmp_path)
     learner.starts_trained = True
     before, critic = parameters(learner.actor), parameters(learner.critic.network)
-    for _ in range(2):
-        learner.update()
+    update(learner, 2)
     assert torch.equal(parameters(learner.actor), before) and learner.action_step.norms == []  # no gradients
     assert not torch.equal(parameters(learner.critic.network), critic)
-    learner.update()
+    update(learner)
     assert not torch.equal(parameters(learner.actor), before)
 
 
@@ -242,10 +245,10 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
 
     spec = replace(dittogym.make_spec("run"), reward_fn=ends_at_once, weights={"alive": 1.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
-    reward = RewardConfig(success_reward=2.0)  # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
-    config = WindowConfig(task="run", reward=reward, window=1, gamma=0.9, max_episode_steps=10)
+    # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
+    config = WindowConfig(task="run", algo="shac", success_reward=2.0, window=1, gamma=0.9, max_episode_steps=10)
     collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
-    window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
+    window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0, go_on)
     assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]
 
 
@@ -256,9 +259,9 @@ def test_gradients_that_are_not_finite_are_left_out_with_a_warning():
 
     spec = replace(dittogym.make_spec("run"), reward_fn=rooted, weights={"risen": 1.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
-    collector = WindowCollector(env, lambda: torch.zeros(2, 1), WindowConfig(task="run", window=2))
+    collector = WindowCollector(env, lambda: torch.zeros(2, 1), WindowConfig(task="run", algo="shac", window=2))
     action = torch.zeros(2, *env.action_shape, requires_grad=True)
-    window = collector.collect(lambda _: action, lambda seen: seen[:, 0])
+    window = collector.collect(lambda _: action, lambda seen: seen[:, 0], go_on)
     window.rewards.sum().backward()
     with pytest.warns(UserWarning, match="most gradients of a window are not finite and were left out"):
         assert collector.scalars(window)["train/dropped"] == 4

@@ -1,28 +1,159 @@
-from dataclasses import replace
+"""The replay ring, its chunks on disk, checkpoints of both learners, and the lock of a folder."""
 
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from threading import Timer
+
+import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
-from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.policies import CFPPolicy
+import cfp
+from cfp import CFPAnalytic, CFPPolicy, Hyperparameters
 from cfp.envs.vec_env import monitored
 from cfp.errors import CheckpointError
-from cfp.experiment.algorithm import Position
-from cfp.experiment.checkpoint import Checkpoint
-from cfp.experiment.sac_learner import SACLearner
+from cfp.experiment.checkpoint import Checkpoint, ReplayArchive
+from cfp.experiment.folder import FolderInUse, run_lock
+from cfp.files import write_atomically
 from cfp.presets import sac_preset
+from cfp.sac.learner import CFPSAC
+from cfp.sac.replay import ReplayRing
 
-CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,), device="cpu")
+SPACES = spaces.Box(0, 255, (3, 64, 64), np.uint8), spaces.Box(-1, 1, (2, 8, 8), np.float32)
+FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+ANALYTIC = replace(
+    cfp.preset("shapematch", "quick", "cfp-analytic"),
+    **{"particles": 100, "train_particles": 100, "substeps": 1, "num_envs": 2, "resolutions": (4,), "steps": 64},
+    **{"window": 4, "minibatches": 2, "minibatch_size": 4, "windows_kept": 2, "max_episode_steps": 6, "device": "cpu"},
+)
+SAC = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,), device="cpu")
 
 
-def make(stage=2):
+def make_ring(rows=6, envs=2):
+    return ReplayRing(rows * envs, *SPACES, device="cpu", n_envs=envs, seed=0)
+
+
+def fill(ring, start, stop):
+    """Store rows whose every number tells which row it is."""
+    for row in range(start, stop):
+        image = np.full((2, 3, 64, 64), row, np.uint8)
+        action = np.full((2, 2, 8, 8), row / 100, np.float32)
+        infos = [{"TimeLimit.truncated": row % 3 == 0}, {}]
+        ring.add(image, image + 1, action, np.array([row, -row], np.float32), np.array([row % 2 == 0] * 2), infos)
+
+
+def assert_same_ring(first, second):
+    for name in (*FIELDS, "pos", "full"):
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
+
+
+def test_batch_has_no_repetition_and_keeps_rows_together():
+    ring = make_ring()
+    fill(ring, 0, 6)
+    batch = ring.sample(12)
+    assert sorted(batch.rewards[:, 0].tolist()) == sorted([float(r) for r in range(6)] + [-float(r) for r in range(6)])
+    row = batch.rewards[:, 0].abs()
+    assert (batch.observations[:, 0, 0, 0] == row).all()
+    assert (batch.next_observations[:, 0, 0, 0] == row + 1).all()
+    np.testing.assert_allclose(batch.actions[:, 0], row / 100, rtol=1e-6)
+    first = batch.rewards[:, 0] > 0  # element 0 of the batch has the time limits, at rows 0, 3, ...
+    limit = first & (row % 3 == 0)
+    expected = ((row % 2 == 0) & ~limit & (row > 0)).float()
+    assert (batch.dones[row > 0, 0] == expected[row > 0]).all()
+    assert len(ring.sample(20).rewards) == 20
+    with pytest.raises(ValueError, match="optimize_memory_usage must be False"):
+        ReplayRing(12, *SPACES, optimize_memory_usage=True, handle_timeout_termination=False)
+
+
+@pytest.mark.parametrize("saves", [(3, 7), (5, 8, 11, 14), (2, 20, 23)])
+def test_ring_comes_back_from_its_chunks_which_never_change(tmp_path, saves):
+    ring, archive, done, written = make_ring(), ReplayArchive(tmp_path, 1), 0, {}
+    for rows in saves:
+        fill(ring, done, rows)
+        done = rows
+        chunks = archive.save(ring, rows)
+        assert all(path.read_bytes() == content for path, content in written.items())  # until they are pruned
+        archive.prune()
+        other = make_ring()
+        ReplayArchive(tmp_path, 1).load(other, rows, chunks)
+        assert_same_ring(ring, other)
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(chunk["file"] for chunk in chunks)
+        assert all(chunk["stop"] > rows - 6 for chunk in chunks)
+        written = {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+def test_chunks_of_the_last_checkpoint_outlive_the_next_save(tmp_path):
+    ring, kept, other, archive = make_ring(), make_ring(), make_ring(), ReplayArchive(tmp_path, 1)
+    fill(ring, 0, 4)
+    fill(kept, 0, 4)
+    chunks = archive.save(ring, 4)
+    fill(ring, 4, 16)
+    archive.save(ring, 16)  # killed here: the state file still names the old chunks
+    ReplayArchive(tmp_path, 1).load(other, 4, chunks)
+    assert_same_ring(kept, other)
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "flipped"])
+def test_damaged_chunk_is_named(tmp_path, damage):
+    ring = make_ring()
+    fill(ring, 0, 4)
+    chunks = ReplayArchive(tmp_path, 1).save(ring, 4)
+    path = tmp_path / chunks[0]["file"]
+    content = bytearray(path.read_bytes())
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        content[len(content) // 2] ^= 0xFF
+        path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=chunks[0]["file"]):
+        ReplayArchive(tmp_path, 1).load(make_ring(), 4, chunks)
+
+
+def test_gap_between_chunks_is_noticed(tmp_path):
+    ring, archive = make_ring(), ReplayArchive(tmp_path, 1)
+    for rows in (2, 4, 6):
+        fill(ring, rows - 2, rows)
+        chunks = archive.save(ring, rows)
+    with pytest.raises(CheckpointError, match="rows 2 to 4"):
+        ReplayArchive(tmp_path, 1).load(make_ring(), 6, [chunks[0], chunks[2]])
+    with pytest.raises(CheckpointError, match="rows 4 to 6"):
+        ReplayArchive(tmp_path, 1).load(make_ring(), 6, chunks[:2])
+
+
+def test_pruning_deletes_chunks_only(tmp_path):
+    """The folder of a stranger's run may be a link to one of mine."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("precious")
+    (tmp_path / "replay").symlink_to(mine)
+    ring, archive = make_ring(), ReplayArchive(tmp_path / "replay", 1)
+    fill(ring, 0, 4)
+    chunks = archive.save(ring, 4)
+    (mine / "stage1-000000000-000000002.npz").touch()
+    archive.prune()
+    assert sorted(path.name for path in mine.iterdir()) == [chunks[0]["file"], "thesis.tex"]
+
+
+def make_sac(stage=2):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
-    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage), horizon=7))
-    spec = CONFIG.actor_spec(stage)
-    hyperparameters = Hyperparameters(buffer_size=40, batch_size=4, update_start=6, random_steps=10, gate_penalty=0.1)
-    return SACLearner(CONFIG, stage, env, CFPPolicy, {"spec": spec}, hyperparameters)
+    env = monitored(FakeEnv(num_envs=2, resolution=SAC.action_size(stage), horizon=7))
+    own = Hyperparameters(buffer_size=40, batch_size=4, update_start=6, random_steps=10, gate_penalty=0.1)
+    model = CFPSAC(CFPPolicy, env, own, seed=0, device="cpu", policy_kwargs={"spec": SAC.actor_spec(stage)})
+    model.config, model.stage = SAC, stage
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def make_analytic(tmp_path):
+    return CFPAnalytic.create(ANALYTIC, 1, tmp_path)
 
 
 class Hook(BaseCallback):
@@ -55,67 +186,119 @@ def assert_same(first, second, path="state"):
         assert first == second, path
 
 
-@pytest.mark.parametrize("stop", [8, *(pytest.param(late, marks=pytest.mark.slow) for late in (22, 50))])
-def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, stop):
-    checkpoint = Checkpoint(tmp_path)
+@pytest.mark.parametrize(
+    ("learner", "stop"),
+    [
+        ("sac", 8),
+        ("sac", 22),
+        pytest.param("sac", 50, marks=pytest.mark.slow),
+        ("analytic", 24),
+    ],
+)
+def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, learner, stop):
+    checkpoint, config = Checkpoint(tmp_path), SAC if learner == "sac" else ANALYTIC
 
-    def save(_):
-        if algorithm.num_timesteps == stop:
-            checkpoint.save(algorithm, CONFIG, Position(2, 100))
+    def make():
+        return make_sac() if learner == "sac" else make_analytic(tmp_path)
 
-    algorithm = make()
-    algorithm.learn(70, Hook(save))
+    def save(model):
+        if model.num_timesteps == stop:
+            checkpoint.save(model, config, 100)
+
+    model = make()
+    model.learn(70, Hook(save))
     resumed = make()
     torch.rand(5)  # generators are somewhere else
     state = Checkpoint(tmp_path).read()
-    assert (state["stage"], state["offset"]) == (2, 100)
+    assert (state["stage"], state["offset"]) == (model.stage, 100)
     Checkpoint(tmp_path).restore(resumed, state)
     assert resumed.num_timesteps == stop
-    resumed.learn(70 - stop)
-    assert_same(resumed.state_dict(), algorithm.state_dict())
-    batch, again = algorithm.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
-    assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
+    resumed.learn(70 - stop, reset_num_timesteps=False)
+    assert_same(resumed.state_dict(), model.state_dict())
+    if learner == "sac":
+        batch, again = model.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
+        assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-@pytest.mark.parametrize(
-    "writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.experiment.replay_archive.write_atomically"]
-)
-def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
-    checkpoint, algorithm = Checkpoint(tmp_path), make()
-    algorithm.learn(20)
-    checkpoint.save(algorithm, CONFIG, Position(2))
-    algorithm.learn(30)
+@pytest.mark.parametrize("file", ["state.pt", "stage"])
+def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, file):
+    checkpoint, model = Checkpoint(tmp_path), make_sac()
+    model.learn(20)
+    checkpoint.save(model, SAC, 0)
+    model.learn(30, reset_num_timesteps=False)
 
     def crash(path, write):
+        if not path.name.startswith(file):
+            return write_atomically(path, write)
         path.with_name(path.name + ".part").write_bytes(b"half a file")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(writer, crash)
+    monkeypatch.setattr("cfp.experiment.checkpoint.write_atomically", crash)
     with pytest.raises(OSError, match="No space"):
-        checkpoint.save(algorithm, CONFIG, Position(2))
+        checkpoint.save(model, SAC, 0)
     monkeypatch.undo()
-    other = make()
+    other = make_sac()
     Checkpoint(tmp_path).restore(other, Checkpoint(tmp_path).read())
-    assert other.num_timesteps == 20
-    assert other.replay_buffer.size() == 10
+    assert (other.num_timesteps, other.replay_buffer.size()) == (20, 10)
 
 
-def test_next_stage_replaces_the_replay_of_the_last(tmp_path):
-    checkpoint, coarse, fine = Checkpoint(tmp_path), make(1), make(2)
+def test_next_stage_replaces_the_replay_of_the_last_and_its_state_fits_no_other(tmp_path):
+    checkpoint, coarse, fine, other = Checkpoint(tmp_path), make_sac(1), make_sac(2), make_sac(2)
     coarse.learn(12)
-    checkpoint.save(coarse, CONFIG, Position(1))
+    checkpoint.save(coarse, SAC, 0)
     fine.learn(8)
-    checkpoint.save(fine, CONFIG, Position(2, 12))
+    checkpoint.save(fine, SAC, 12)
     assert [path.name for path in (tmp_path / "replay").iterdir()] == ["stage2-000000000-000000004.npz"]
-    state = Checkpoint(tmp_path).read()
-    other = make(2)
-    Checkpoint(tmp_path).restore(other, state)
+    Checkpoint(tmp_path).restore(other, Checkpoint(tmp_path).read())
     assert other.replay_buffer.size() == 4
-
-
-def test_state_of_another_network_is_refused(tmp_path):
-    checkpoint, algorithm = Checkpoint(tmp_path), make(2)
-    algorithm.learn(8)
-    checkpoint.save(algorithm, CONFIG, Position(2))
     with pytest.raises(CheckpointError, match="does not fit"):
-        checkpoint.restore(make(1), checkpoint.read())
+        checkpoint.restore(make_sac(1), checkpoint.read())
+
+
+# What `run_lock` does, without the imports of the package, which take seconds.
+HOLD = """
+import os, sys
+from pathlib import Path
+from filelock import FileLock
+folder = Path(sys.argv[1])
+folder.mkdir()
+with FileLock(folder / ".lock"):
+    (folder / ".lock").write_text(f"process {os.getpid()} on a machine")
+    print(1, flush=True)
+    input()
+"""
+
+
+def test_folder_is_held_by_one_process_until_it_ends(tmp_path):
+    folder, pipe = tmp_path / "run", subprocess.PIPE
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdin=pipe, stdout=pipe, text=True)
+    assert process.stdout.readline() == "1\n"
+    try:
+        for timeout in (0, 0.1):
+            with (
+                pytest.raises(FolderInUse, match=f"out: {folder} is in use by process {process.pid} on"),
+                run_lock(folder, timeout),
+            ):
+                pass
+        Timer(0.3, process.kill).start()
+        with run_lock(folder, 60):  # waits for it
+            assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} on ")
+    finally:
+        process.kill()
+        process.communicate()
+    assert folder.exists() and not list(folder.iterdir())
+
+
+def test_new_folder_goes_again_if_nothing_was_written_and_a_linked_lock_is_left_alone(tmp_path):
+    with pytest.raises(ValueError, match="refused"), run_lock(tmp_path / "a" / "empty"):
+        raise ValueError("refused")
+    assert not (tmp_path / "a" / "empty").exists()
+    with run_lock(tmp_path / "full"):
+        (tmp_path / "full" / "file").touch()
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
+    mine = tmp_path / "mine.txt"
+    mine.write_text("precious")
+    (tmp_path / "full" / ".lock").symlink_to(mine)
+    with pytest.raises(OSError, match=r"\.lock"), run_lock(tmp_path / "full"):
+        pass
+    assert mine.read_text() == "precious"

@@ -1,46 +1,40 @@
+"""Options and presets: published values, types, shares of steps, values of stages, environments."""
+
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from policy_files import save_actor
 
+import cfp
 import dittogym
-from cfp.analytic.episodes import Episodes
-from cfp.config import to_json
+from cfp.agent.actor import build_actor
+from cfp.analytic.window import Episodes
+from cfp.config import to_json, update_from_dict
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import evaluation_seed
-from cfp.experiment.checkpoint import check_same
-from cfp.experiment.training import parse
-from cfp.from_dict import update_from_dict
-from cfp.presets import TASKS, from_json, sac_preset
-from cfp.sections import EnvironmentConfig
-from cfp.train import PROGRAM
-from dittogym import make_spec
+from cfp.presets import PAPER, analytic_preset, sac_preset
+from cfp.registry import configure
+
+PRESETS = [*((name, "cfp-sac") for name in ("quick", "long", "paper")), ("quick", "cfp-analytic")]
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", ["quick", "long", "paper"])
-def test_every_preset_is_valid_and_survives_json(task, name):
-    config = sac_preset(task, name)
+def sac(**values):
+    return configure({"task": "run", "algo": "cfp-sac", **values})
+
+
+@pytest.mark.parametrize("task", PAPER)
+@pytest.mark.parametrize(("name", "algo"), PRESETS)
+def test_every_preset_is_valid_and_survives_json(task, name, algo):
+    config = cfp.preset(task, name, algo)
     config.check()
-    assert from_json(json.loads(json.dumps(to_json(config)))) == config
+    assert configure(json.loads(json.dumps(to_json(config)))) == config
     stages = range(1, len(config.resolutions) + 1)
     assert sum(config.stage_steps(stage) for stage in stages) == config.steps
     assert [config.actor_spec(stage).resolutions[-1] for stage in stages] == list(config.resolutions)
-
-
-def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
-    spec = replace(make_spec("run"), name="hop", coarse=4, fine=32)
-    monkeypatch.setitem(dittogym.TASKS, "hop", lambda: spec)
-    config = sac_preset("hop")
-    config.check()
-    assert (config.task, config.resolutions) == ("hop", (4, 32))
-    assert replace(config, task="run", resolutions=(4, 8)) == sac_preset("run")
-    with pytest.raises(ConfigError, match="preset must be one of quick, long for hop, got 'paper'"):
-        sac_preset("hop", "paper")
 
 
 def test_paper_presets_hold_the_published_numbers():
@@ -54,118 +48,145 @@ def test_paper_presets_hold_the_published_numbers():
         "catch": (0.1, 0.1, -1, 0.01, 6000, 243_000, 380_000),
         "slot": (0.05, 0.05, -2, 0.1, 6000, 293_000, 600_000),
     }
-    assert set(published) == set(TASKS)
+    assert set(published) == set(PAPER)
     for task, (first, second, bias, penalty, random_steps, handover, steps) in published.items():
         config = sac_preset(task, "paper")
-        assert config.alpha == (first, second)
-        assert (config.gate_bias, config.gate_penalty) == ((bias,), (penalty,))
-        assert config.random_steps == (random_steps, 100)
-        assert (config.handover, config.steps) == ((handover,), steps)
-        assert config.resolutions == ((32, 64) if task == "shapematch" else (8, 16))
-        assert config.network.split == (task == "dig")
-        assert config.network.gate_scale == (0.25 if task == "dig" else 1.0)
-        assert config.environment.num_envs == 1
-        assert config.report.eval_deterministic == (task == "shapematch")
-        learning = config.learning
-        assert (learning.gamma, learning.tau, learning.learning_rate, learning.batch_size) == (0.99, 0.005, 3e-4, 256)
-        assert (learning.buffer_size, learning.gradient_steps, learning.update_start) == (200_000, 1, 256)
-        assert config.environment.variant == ("published" if task == "slot" else None)
-    assert {task: TASKS[task].seed for task in TASKS if TASKS[task].seed} == {"catch": 2, "slot": 1}
+        one, two = (config.hyperparameters(stage) for stage in (1, 2))
+        assert (one.alpha, two.alpha, two.gate_penalty) == (first, second, penalty)
+        assert (one.random_steps, two.random_steps) == (random_steps, 100)
+        assert (one.actor_start, two.actor_start) == (0, 0)
+        assert config.ends() == (handover, steps)
+        spec = config.actor_spec(2)
+        assert spec.resolutions == ((32, 64) if task == "shapematch" else (8, 16))
+        assert (spec.gate_bias, spec.split, spec.encoder) == ((bias,), task == "dig", "paper")
+        assert (spec.gate_scale, spec.interpolation) == (0.25 if task == "dig" else 1.0, "aligned")
+        assert (config.num_envs, config.particles) == (1, "full")
+        assert config.eval_deterministic == (task == "shapematch")
+        assert (config.gamma, config.tau, config.learning_rate, config.batch_size) == (0.99, 0.005, 3e-4, 256)
+        assert (config.buffer_size, config.gradient_steps, config.update_start) == (200_000, 1, 256)
+        assert config.variant == ("published" if task == "slot" else None)
+        assert config.seed == {"catch": 2, "slot": 1}.get(task, 0)
+
+
+def test_quick_learns_by_gradients_and_paper_from_rewards():
+    algos = [cfp.preset("run", *words).algo for words in ((), ("long",), ("paper",), ("quick", "cfp-sac"))]
+    assert algos == ["cfp-analytic", "cfp-sac", "cfp-sac", "cfp-sac"]
+    for words, named in ((("paper", "cfp-analytic"), "preset"), (("quick", "ppo"), "algo"), (("slow",), "preset")):
+        with pytest.raises(ConfigError, match=named):
+            cfp.preset("run", *words)
+    assert cfp.preset("run").name == "cfp-analytic-run-quick-0"
+
+
+def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
+    def hop(variant: str = "soft") -> dittogym.TaskSpec:
+        stiffness = {"soft": 100.0, "stiff": 200.0}
+        return replace(dittogym.make_spec("run"), name="hop", coarse=4, fine=32, mu=stiffness[variant])
+
+    monkeypatch.setitem(dittogym.TASKS, "hop", hop)
+    config = sac_preset("hop")
+    config.check()
+    assert (config.task, config.resolutions) == ("hop", (4, 32))
+    assert replace(config, task="run", resolutions=(4, 8)) == sac_preset("run")
+    assert configure({"task": "hop", "variant": "stiff"}).make_spec().mu == 200.0
+    with pytest.raises(ConfigError, match="preset must be one of quick, long for hop, got 'paper'"):
+        sac_preset("hop", "paper")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"steps": "x"}, "steps must be of type int, got 'x'"),
+        ({"steps": 1.5}, "steps must be of type int"),
+        ({"steps": None}, "steps must be of type int"),
+        ({"steps": True}, "steps must be of type int"),
+        ({"video": 1}, "video must be of type bool"),
+        ({"tau": "0.5"}, "tau must be of type float"),
+        ({"dtype": "float16"}, r"dtype must be of type Literal\['float32', 'float64'\]"),
+        ({"particles": [1.5, 2]}, "particles must be of type"),
+        ({"alpha": [0.1, "x"]}, r"alpha must be of type tuple\[float, ...\]"),
+        ({"alpha": [0.1, True]}, "alpha must be of type"),
+        ({"resolutions": 8}, "resolutions must be of type"),
+        ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
+        ({"target": 3}, "target must be of type str | None"),
+        ({"tau": 10**400}, r"tau must be below 2\*\*63"),
+        ({"gate_bias": [10**400]}, r"gate_bias must be below 2\*\*63"),
+        ({"colour": 1}, "colour is not an option"),
+        ({"environment": {"particles": 3}}, "environment is not an option"),
+    ],
+)
+def test_value_of_another_type_is_named(values, message):
+    with pytest.raises(ConfigError, match=message):
+        sac(**values)
 
 
 def test_json_values_take_the_types_of_their_fields():
-    config = update_from_dict(
-        sac_preset("shapematch"), {"alpha": [1, 0], "environment": {"particles": [500, 20], "target": None}}
-    )
-    assert config.alpha == (1.0, 0.0)
-    assert all(isinstance(value, float) for value in config.alpha)
-    assert config.environment.particles == (500, 20)
+    config = update_from_dict(sac_preset("shapematch"), {"alpha": [1, 0], "particles": [500, 20], "dt": 1})
+    assert (config.alpha, config.particles, config.target) == ((1, 0), (500, 20), None)
+    assert isinstance(config.dt, float)
 
 
-def test_command_line_beats_file_beats_preset(tmp_path):
-    file = tmp_path / "options.json"
-    file.write_text(json.dumps({"task": "run", "learning": {"gamma": 0.5, "tau": 0.25}, "report": {"video": True}}))
-    command = parse(
-        PROGRAM,
-        [
-            "--config",
-            str(file),
-            "--learner",
-            "sac",
-            "--gamma",
-            "0.75",
-            "--no-video",
-            "--particles",
-            "300",
-            "--out",
-            "x",
-        ],
-    )
-    assert command.run.task == "run"
-    assert (command.run.learning.gamma, command.run.learning.tau) == (0.75, 0.25)
-    assert command.run.report.video is False
-    assert command.run.environment.particles == 300
-    assert command.run.learning.batch_size == sac_preset("run").learning.batch_size
-    assert parse(PROGRAM, ["--video"]).run.report.video is True
-    assert parse(PROGRAM, ["--particles", "full"]).run.environment.particles == "full"
-    assert parse(PROGRAM, ["--particles", "500", "20"]).run.environment.particles == (500, 20)
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"steps": 0}, "steps must be at least 1, got 0"),
+        ({"seed": -1}, "seed must be between"),
+        ({"num_envs": 10_001}, "num_envs must be at most 10000"),
+        ({"alpha": [float("nan")]}, "alpha must be finite"),
+        ({"alpha": []}, "alpha must have at least one value"),
+        ({"resolutions": []}, "resolutions must have at least one value"),
+        ({"resolutions": [8, 7]}, "resolutions must be increasing values"),
+        ({"resolutions": [4, 8, 16]}, "handover must have 2 values"),
+        ({"handover": [1.0]}, "handover must be shares of the steps between 0 and 1"),
+        ({"resolutions": [4, 8, 16], "handover": [0.5, 0.4]}, "steps and handover must give every stage"),
+        ({"steps": 20}, "steps and handover must give every stage at least 16 steps"),
+        ({"critics_first": [1.0]}, "critics_first must be at least 0 and less than 1, got 1"),
+        ({"noise_cells": 3}, "noise_cells must be one of"),
+        ({"noise_cells": 8}, "noise_cells must be at most 4"),
+        ({"noise_scale": [0.0, 1.0]}, "noise_scale must be positive"),
+        ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
+        ({"gamma": 1.0}, "gamma must be below 1 with several n_steps"),
+        ({"buffer_size": 20}, "buffer_size must be at least batch_size"),
+        ({"refine": True}, "refine requires start_from"),
+        ({"algo": "cfp-analytic", "window": 0}, "window must be at least 1, got 0"),
+        ({"algo": "cfp-analytic", "action_step": [0.0]}, "action_step must be positive, got 0"),
+        ({"algo": "cfp-analytic", "weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
+        ({"algo": "cfp-analytic", "num_layouts": 9_999}, "num_layouts must be at most 9992"),
+        ({"algo": "cfp-analytic", "resample": True}, "resample must be False for cfp-analytic"),
+        ({"algo": "cfp-analytic", "train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
+    ],
+)
+def test_value_out_of_range_is_named(values, message):
+    with pytest.raises(ConfigError, match=message):
+        sac(**values).check()
 
 
-def test_fewer_steps_shorten_every_stage(tmp_path):
-    config = sac_preset("run")
-    half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
-    assert half.handover == (config.handover[0] // 2,)
-    assert half.learning.actor_start == config.learning.actor_start // 2
-    explicit = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", "1000", "--handover", "900"]).run
-    assert explicit.handover == (900,)
-    explicit = parse(PROGRAM, "--learner sac --task run --steps 1000 --actor-start 4000".split()).run
-    assert explicit.learning.actor_start == 4000
-    options = {"learner": "sac", "task": "run", "steps": 1000, "learning": {"actor_start": 4000}}
-    (tmp_path / "options.json").write_text(json.dumps(options))
-    assert parse(PROGRAM, ["--config", str(tmp_path / "options.json")]).run == explicit
-    longer = parse(PROGRAM, "--learner sac --task run --steps 100000".split()).run
-    assert longer.learning == config.learning
-
-
-def test_critics_of_later_stages_learn_first():
-    config = replace(sac_preset("run"), critics_first=0.25)
-    starts = [config.hyperparameters(stage).actor_start for stage in (1, 2)]
-    assert starts == [config.learning.actor_start, max(config.learning.actor_start, config.stage_steps(2) // 4)]
-    assert sac_preset("run", "paper").hyperparameters(2).actor_start == 0
-    with pytest.raises(ConfigError, match="critics_first must be at least 0 and less than 1, got 1"):
-        replace(config, critics_first=1.0).check()
-
-
-def test_another_number_of_stages_stretches_what_each_has_one_of():
-    five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
-    assert five.handover == (1000, 2000, 3000, 4000)
-    assert five.alpha == (0.005,) * 5
-    assert five.gate_bias == (-3.0,) * 4 and five.gate_penalty == (0.8,) * 4
-    assert five.random_steps == (480, 100, 100, 100, 100)
-    three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
-    assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
-    one = parse(PROGRAM, "--learner sac --resolutions 16".split()).run
-    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
-    with pytest.raises(ConfigError, match="alpha must have 3 values"):
-        parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 4".split())
+def test_shares_follow_the_steps_and_the_last_value_holds_for_all_further_stages():
+    half = sac(steps=sac_preset("run").steps // 2)
+    assert half.ends() == tuple(end // 2 for end in sac_preset("run").ends())
+    assert half.hyperparameters(1).actor_start == sac_preset("run").hyperparameters(1).actor_start // 2
+    critics = sac(critics_first=[0.25], steps=8_000)
+    assert [critics.hyperparameters(stage).actor_start for stage in (1, 2)] == [1_500, 500]
+    grids = [4, 8, 16]
+    three = sac(resolutions=grids, handover=[0.25, 0.5], steps=4_000, alpha=[0.1, 0.2], gate_penalty=[1.0, 2.0])
+    three.check()
+    assert three.ends() == (1_000, 2_000, 4_000)
+    assert [three.hyperparameters(stage).alpha for stage in (1, 2, 3)] == [0.1, 0.2, 0.2]
+    assert [three.hyperparameters(stage).gate_penalty for stage in (1, 2, 3)] == [0.0, 1.0, 2.0]
+    assert three.actor_spec(3).gate_bias == (-3.0, -3.0)
+    one = sac(resolutions=[8])
+    one.check()
+    assert one.ends() == (one.steps,) and one.actor_spec(1).gate_bias == ()
 
 
 def test_matter_of_the_published_run_of_slot_can_be_chosen():
-    def matter(*arguments):
-        config = parse(PROGRAM, ["--particles", "100", *arguments]).run
-        spec = make_env(config, 8, 1).venv.torch_env.spec
+    def matter(**values):
+        spec = make_env(configure({"task": "slot", "particles": 100, **values}), 8, 1).venv.torch_env.spec
         return spec.mu, spec.yield_stress, spec.max_actuation
 
-    assert matter("--task", "slot") == (500.0, 85.0, 40.0)
-    assert matter("--task", "slot", "--variant", "published") == (650.0, 90.0, 45.0)
-    assert matter("--task", "slot", "--preset", "paper") == (650.0, 90.0, 45.0)
-    with pytest.raises(ConfigError, match="unexpected keyword argument 'variant'"):
-        matter("--task", "run", "--variant", "published")
-
-
-def test_runs_of_both_learners_have_folders_of_their_own():
-    assert parse(PROGRAM, ["--task", "run"]).out == Path("runs/analytic-run-quick-0")
-    assert parse(PROGRAM, ["--task", "run", "--learner", "sac"]).out == Path("runs/cfp-run-quick-0")
+    assert matter() == (500.0, 85.0, 40.0)
+    assert matter(variant="published") == matter(preset="paper") == (650.0, 90.0, 45.0)
+    with pytest.raises(ConfigError, match="variant"):
+        matter(task="run", variant="published")
 
 
 def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
@@ -182,77 +203,54 @@ def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
     for _ in range(3):
         episodes.restart(done, done, done)
     assert len(set(trained)) == 4 and min(trained) >= 5 and max(trained) < 5 + 8
-
-    config = parse(PROGRAM, "--task run --seed 5 --eval-episodes 7".split()).run
+    config = sac(seed=5, eval_episodes=7)
     assert config.evaluation(1) == config.evaluation(2) == (10_005, 7)
     assert evaluation_seed(config) == 20_005
 
 
-def test_variants_of_custom_tasks_have_their_own_names(monkeypatch):
-    def wide(variant: str = "soft") -> dittogym.TaskSpec:
-        stiffness = {"soft": 100.0, "stiff": 200.0}
-        return replace(dittogym.make_spec("run"), name="wide", mu=stiffness[variant])
-
-    monkeypatch.setattr("dittogym.tasks.TASKS", {**dittogym.TASKS, "wide": wide})
-    run = parse(PROGRAM, ["--task", "wide", "--variant", "stiff"]).run
-    assert run.make_spec().mu == 200.0
-
-
 def test_a_step_keeps_its_duration_with_other_substeps():
-    def substeps(*arguments):
-        config = parse(PROGRAM, ["--task", "run", "--particles", "100", *arguments]).run
-        model = make_env(config, 8, 1).venv.torch_env.model
+    def substeps(**values):
+        model = make_env(sac(particles=100, **values), 8, 1).venv.torch_env.model
         return model.solver.dt, model.substeps
 
     assert substeps() == (1e-4, 100)
-    assert substeps("--dt", "2e-4") == (2e-4, 50)
-    assert substeps("--dt", "2e-4", "--substeps", "10") == (2e-4, 10)
-    for wrong, message in (
-        ("3e-4", "dt must divide"),
-        ("1e-320", "dt must divide"),
-        ("0", "dt must be positive"),
-        ("5e-4", "dt must be at most"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            substeps("--dt", wrong)
-
-
-def test_gradient_methods_simulate_with_longer_substeps_where_that_was_measured():
-    own = EnvironmentConfig()
-    assert own.for_optimisation("run", 500) == replace(own.with_particles(500), dt=2e-4, substeps=50)
-    for task in ("shapematch", "dig", "custom:task"):
-        assert own.for_optimisation(task) == own
-    for given in (replace(own, substeps=100), replace(own, dt=5e-5)):
-        assert given.for_optimisation("run") == given
-    assert own.for_optimisation("dig", dt=1.25e-4) == replace(own, dt=1.25e-4, substeps=80)
-    assert replace(own, substeps=20).for_optimisation("run", dt=2e-4) == replace(own, dt=2e-4, substeps=10)
-    with pytest.raises(ConfigError, match=r"train_dt must divide an environment step of 0\.01 s, got 0\.0003"):
-        own.for_optimisation("run", dt=3e-4)
+    assert substeps(dt=2e-4) == (2e-4, 50)
+    assert substeps(dt=2e-4, substeps=10) == (2e-4, 10)
+    for wrong in (3e-4, 1e-320, 0.0, 5e-4):
+        with pytest.raises(ConfigError, match="dt must"):
+            substeps(dt=wrong)
+    config = configure({"task": "run", "train_particles": 500, "train_dt": 2e-4})
+    trained = config.for_training().environment
+    assert trained == replace(config.environment, particles=500, dt=2e-4, substeps=50)
 
 
 def test_layout_of_actions_can_be_chosen():
-    def field(*arguments):
-        config = parse(PROGRAM, ["--task", "run", "--particles", "100", "--substeps", "1", *arguments]).run
-        env = make_env(config, 2, 1)
+    def field(**values):
+        env = make_env(sac(particles=100, substeps=1, **values), 2, 1)
         env.reset()
         env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
         pull = env.venv.torch_env._actuation[0, 0]
         return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
 
-    image, grid, reference = field(), field("--action-layout", "grid"), field("--parity", "reference")
+    image, grid = field(), field(action_layout="grid")
     assert image[0] > grid[0] and image[1] == grid[1]  # both above the middle, one right of it and one left
-    assert grid == reference
-    assert image == field("--parity", "reference", "--action-layout", "image")
 
 
-def test_resumed_run_may_change_only_what_does_not_alter_it():
-    config = sac_preset("run")
-    stored = json.loads(json.dumps(to_json(config)))
-    check_same(stored, replace(config, steps=99_000, device="cpu", report=replace(config.report, eval_every=7)))
-    check_same(stored, replace(config, environment=replace(config.environment, backend="eager")))
-    with pytest.raises(ConfigError, match=r"gamma: the run was started with 0\.9.*, got 0\.5"):
-        check_same(stored, replace(config, learning=replace(config.learning, gamma=0.5)))
-    with pytest.raises(ConfigError, match="eval_episodes: the run was started with 5, got 9"):
-        check_same(stored, replace(config, report=replace(config.report, eval_episodes=9)))
-    with pytest.raises(ConfigError, match="task: the run was started with 'run', got 'shapematch'"):
-        check_same(stored, replace(config, task="shapematch"))
+def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_without_noise_of_cells():
+    quick, started = sac_preset("run"), sac(start_from="run")
+    assert (quick.encoder, started.encoder) == ("small", "paper")
+    assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
+    changed = {"encoder": "paper", "resolutions": (8, 16), "gradient_steps": 4, "batch_size": 64, "noise_cells": 0}
+    changed |= {"max_episode_steps": None, "n_steps": 1, "weight_average": 0.0, "start_from": "run"}
+    assert started == replace(quick, **changed)
+    asked = sac(start_from="run", noise_cells=2, gradient_steps=8)
+    assert asked == replace(started, noise_cells=2, gradient_steps=8)
+    complete = to_json(started) | {"start_from": "moved-away"}  # as a run's config.json holds it
+    assert configure(complete) == replace(started, start_from="moved-away")
+    assert sac(preset="paper", start_from="run") == replace(sac_preset("run", "paper"), start_from="run")
+
+
+def test_a_policy_of_two_stages_is_refined_by_the_other_learner_with_its_own_gate(tmp_path):
+    config = analytic_preset("run")
+    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    assert sac(start_from=str(tmp_path), refine=True).actor_spec(2) == config.actor_spec(2)

@@ -1,7 +1,5 @@
 """What a run shows while it trains: names, pictures, films, Weights & Biases."""
 
-import importlib
-import re
 import sys
 import types
 from pathlib import Path
@@ -10,20 +8,18 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny_runs import assert_same_run, run
+from tiny_runs import assert_same_run, resume, run
 
-from cfp import train
 from cfp.agent.actor import ActorSpec, build_actor
-from cfp.agent.sac import METRICS
+from cfp.analytic.learner import METRICS as ANALYTIC_METRICS
 from cfp.evaluation.page import PICTURES, muscles, policy_pictures
 from cfp.experiment.callbacks import EVALUATION_COLUMNS, LOG_METRICS
 from cfp.experiment.loggers import EVALUATION_METRICS
-from cfp.experiment.sac_learner import ROLLOUT_METRICS
+from cfp.sac.algorithm import METRICS
+from cfp.sac.learner import ROLLOUT_METRICS
 from cfp.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("short")
-
-PAGE = (Path(__file__).parents[2] / "docs" / "scalars.md").read_text()
 
 
 def events(folder):
@@ -66,29 +62,16 @@ def wandb(monkeypatch):
     return fake
 
 
-def test_everything_written_is_explained_and_everything_explained_is_written(finished):
-    optional = {"train/drift"}  # of refinement
-    rows = set(METRICS | LOG_METRICS | ROLLOUT_METRICS) - optional
-    columns = set(read_table(finished / "progress.csv")[0])
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+def test_everything_written_is_explained_and_everything_explained_is_written(learner, request):
+    folder = request.getfixturevalue("finished" if learner == "sac" else "finished_analytic")
+    rows = set(METRICS | LOG_METRICS | ROLLOUT_METRICS if learner == "sac" else ANALYTIC_METRICS | LOG_METRICS)
+    columns = set(read_table(folder / "progress.csv")[0])
     assert columns - {"step"} == rows - {"time/steps_per_second"}
-    read = events(finished)
+    read = events(folder)
     assert set(read.Tags()["scalars"]) == rows | set(EVALUATION_METRICS)
     assert set(read.Tags()["images"]) == set(PICTURES)
-    assert set(read_table(finished / "evaluations.csv")[0]) == set(EVALUATION_COLUMNS)
-
-
-@pytest.mark.parametrize("package", ["cfp", "baselines"])
-def test_page_shows_every_table_of_names(package):
-    shown = set(" ".join(re.findall(r"\{names-table\} (.*)", PAGE)).split())
-    written = set()
-    root = Path(__file__).parents[2]
-    for path in (root / package).rglob("*.py"):
-        for name in re.findall(r"^([A-Z_]*(?:METRICS|PICTURES|COLUMNS)): dict\[str, str\]", path.read_text(), re.M):
-            written.add(".".join((*path.relative_to(root).with_suffix("").parts, name)))
-    assert written and written == {path for path in shown if path.startswith(f"{package}.")}
-    for path in written:
-        module, _, name = path.rpartition(".")
-        assert all(isinstance(text, str) and text for text in getattr(importlib.import_module(module), name).values())
+    assert set(read_table(folder / "evaluations.csv")[0]) == set(EVALUATION_COLUMNS)
 
 
 def test_evaluations_and_pictures_stand_at_their_steps(finished):
@@ -132,7 +115,7 @@ def test_films_at_intervals_and_weights_and_biases_leave_learning_as_it_was(fini
     assert sent == [(70, films[0].name), (140, films[1].name)]
     (options,) = wandb.started
     assert (options["mode"], options["project"], options["dir"]) == ("offline", "mine", str(folder))
-    assert options["name"] == "cfp-shapematch-quick-0" and options["config"]["learning"]["batch_size"] == 4
+    assert options["name"] == "cfp-sac-shapematch-quick-0" and options["config"]["batch_size"] == 4
     assert ("*", "step") in wandb.steps and wandb.finished == 1
     names = {name for point in wandb.points for name in point} - {"step", "video"}
     tags = events(finished).Tags()
@@ -140,7 +123,7 @@ def test_films_at_intervals_and_weights_and_biases_leave_learning_as_it_was(fini
     last = [point for point in wandb.points if "picture/gate" in point][-1]
     assert last["step"] == 150 and last["picture/gate"] == ("image", (192, 386, 3))
     assert all(value is not None for point in wandb.points for value in point.values())
-    assert train.main(["--out", str(folder), "--resume", "--steps", "160"]) == 0
+    assert resume(folder, "--steps", "160") == 0
     assert wandb.started[1]["id"] == options["id"] and wandb.started[1]["resume"] == "allow"
 
 

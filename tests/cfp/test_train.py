@@ -1,38 +1,42 @@
-"""The command lines that train and evaluate."""
+"""Whole runs: what they leave, how they are stopped and resumed, and what goes wrong around them."""
 
 import html
 import json
 import re
+import resource
 import shlex
 import shutil
 import signal
-import sys
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from policy_files import save_actor
-from tiny_runs import TABLES, TINY, assert_same_run, at_step, run
+import torch
+from tiny_runs import ONE_STAGE, TABLES, assert_same_run, at_step, resume, run
 
-import cfp
 import cfp.experiment.run
-import dittogym
 import torchmpm
-from cfp import evaluate, train
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp import evaluate
 from cfp.config import to_json
-from cfp.evaluation.returns import compare
 from cfp.experiment import callbacks
-from cfp.experiment.cli import program_name
 from cfp.experiment.training import parse
-from cfp.policy import ActorPolicy, policy_file, read_policy, shipped
-from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig
+from cfp.policy import read_policy, write_policy
 from cfp.tables import read_table
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 
 pytestmark = pytest.mark.usefixtures("short")
+
+SHORT = "--steps 40 --handover 0.5 --eval-every 0 --eval-episodes 1".split()
+
+
+def interrupt():
+    signal.raise_signal(signal.SIGINT)
+
+
+def terminate():
+    signal.raise_signal(signal.SIGTERM)
 
 
 def test_run_trains_both_stages_and_leaves_its_files(finished):
@@ -55,48 +59,61 @@ def test_run_trains_both_stages_and_leaves_its_files(finished):
 
 
 def test_another_seed_gives_another_run(tmp_path):
-    options = "--resolutions 4 --handover --steps 30 --random-steps 10 --eval-every 0 --eval-episodes 1".split()
     for seed in "01":
-        assert run(tmp_path / seed, "--seed", seed, *options) == 0
+        assert run(tmp_path / seed, "--seed", seed, *ONE_STAGE, "--steps", "30") == 0
     first, second = (read_table(tmp_path / seed / "progress.csv")[-1] for seed in "01")
     assert first["train/learning_rate"] == second["train/learning_rate"]
     assert first["train/critic_loss"] != second["train/critic_loss"]
 
 
 def test_the_end_of_a_run_names_an_earlier_stage_that_returns_more(finished, tmp_path, monkeypatch, capsys):
-    folder, real = tmp_path / "run", cfp.experiment.run.compare
-    shutil.copytree(finished, folder)
+    folder, real = shutil.copytree(finished, tmp_path / "run"), cfp.experiment.run.compare
 
-    def end(stage, **returns):
+    def named(**returns):
         def adjusted(*arguments):
             return [replace(result, returns=returns.get(result.name[-1], (0.0,))) for result in real(*arguments)]
 
         monkeypatch.setattr("cfp.experiment.run.compare", adjusted)
-        assert train.main(["--out", str(folder), "--resume"]) == 0
-        return f"{stage} has the highest mean return" in capsys.readouterr().out
+        assert resume(folder) == 0
+        return re.findall(r"(stage .) has the highest mean return", capsys.readouterr().out)
 
-    assert end("stage 1", **{"1": (2.0,), "2": (1.0,), "n": (9.0,)})  # whatever zero and random action return
-    assert not end("stage", **{"1": (1.0,), "2": (2.0,)})
+    assert named(**{"1": (2.0,), "2": (1.0,), "n": (9.0,)}) == ["stage 1"]  # whatever zero and random action return
+    assert named(**{"1": (1.0,), "2": (2.0,)}) == []
 
 
-def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, capsys):
-    folder = tmp_path / "stopped"
-    with at_step(44, lambda: signal.raise_signal(signal.SIGINT)):
-        assert run(folder) == 128 + signal.SIGINT
+@pytest.mark.parametrize(("learner", "within", "boundary"), [("sac", 44, 70), ("analytic", 64, 48)])
+def test_stopped_run_goes_on_as_if_nothing_had_happened(learner, within, boundary, tmp_path, request, capsys):
+    whole = request.getfixturevalue("finished" if learner == "sac" else "finished_analytic")
+    folder, stops = tmp_path / "stopped", sorted((within, boundary))
+    with at_step(stops[0], interrupt):
+        assert run(folder, learner=learner) == 128 + signal.SIGINT
     assert "--resume" in capsys.readouterr().out
-    with at_step(70, lambda: signal.raise_signal(signal.SIGTERM)):  # the end of a stage
-        assert train.main(["--out", str(folder), "--resume"]) == 128 + signal.SIGTERM
-    assert f"resuming {folder} at step 44" in capsys.readouterr().out
-    assert train.main(["--out", str(folder), "--resume"]) == 0
-    assert f"resuming {folder} at step 70" in capsys.readouterr().out
-    assert_same_run(folder, finished, (*TABLES, "policy.safetensors"))
+    with at_step(stops[1], terminate):
+        assert resume(folder) == 128 + signal.SIGTERM
+    assert f"resuming {folder} at step {stops[0]}" in capsys.readouterr().out
+    assert resume(folder) == 0
+    assert f"resuming {folder} at step {stops[1]}" in capsys.readouterr().out
+    assert_same_run(folder, whole)
+
+
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+def test_killed_run_goes_on_from_its_last_checkpoint(learner, tmp_path, request):
+    whole = request.getfixturevalue("finished" if learner == "sac" else "finished_analytic")
+
+    def kill():
+        raise RuntimeError("killed")
+
+    with at_step(88, kill), pytest.raises(RuntimeError, match="killed"):
+        run(tmp_path / "run", learner=learner)
+    assert resume(tmp_path / "run") == 0
+    assert_same_run(tmp_path / "run", whole)
 
 
 def test_run_stopped_in_an_evaluation_repeats_it(finished, tmp_path):
     folder, real = tmp_path / "stopped", callbacks.make_trial
 
     def stop(*arguments, **options):
-        signal.raise_signal(signal.SIGTERM)
+        terminate()
         return real(*arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -111,220 +128,132 @@ def test_run_stopped_in_an_evaluation_repeats_it(finished, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="killed"):
         patch.setattr(callbacks.EvaluationCallback, "_on_training_start", crash)
-        train.main(["--out", str(folder), "--resume"])
-    assert train.main(["--out", str(folder), "--resume"]) == 0  # finds the row, and does not add it again
-    assert_same_run(folder, finished, (*TABLES, "policy.safetensors"))
+        resume(folder)
+    assert resume(folder) == 0  # finds the row, and does not add it again
+    assert_same_run(folder, finished)
 
 
 @pytest.mark.slow
 def test_layouts_that_are_drawn_anew_go_on_as_if_nothing_had_happened(tmp_path):
-    options = "--resample --resolutions 4 --handover --random-steps 10 --steps 128 --eval-every 0 --eval-episodes 1"
-    assert run(tmp_path / "whole", *options.split()) == 0
-    with at_step(80, lambda: signal.raise_signal(signal.SIGINT)):  # in the second episode; the third begins at 120
-        assert run(tmp_path / "stopped", *options.split()) == 128 + signal.SIGINT
-    assert run(tmp_path / "stopped", *options.split(), "--resume") == 0
+    options = ["--resample", *ONE_STAGE, "--steps", "128"]
+    assert run(tmp_path / "whole", *options) == 0
+    with at_step(80, interrupt):  # in the second episode; the third begins at 120
+        assert run(tmp_path / "stopped", *options) == 128 + signal.SIGINT
+    assert resume(tmp_path / "stopped") == 0
     assert_same_run(tmp_path / "stopped", tmp_path / "whole", ("progress.csv", "results.json"))
 
 
-def test_other_options_than_the_checkpoint_s_are_refused(finished, tmp_path, capsys):
-    assert run(finished, "--resume", "--task", "run") == 2
-    assert "task: the run was started with 'shapematch', got 'run'" in capsys.readouterr().err
-    (tmp_path / "new.json").write_text('{"learning": {"gamma": 0.5}}')
-    assert train.main(["--out", str(finished), "--resume", "--config", str(tmp_path / "new.json")]) == 2
-    assert "gamma: the run was started with 0.95, got 0.5" in capsys.readouterr().err
+def test_only_some_options_may_change_when_a_run_is_resumed(finished, tmp_path, capsys):
+    (tmp_path / "new.json").write_text('{"gamma": 0.5}')
+    for options, named in (
+        (["--task", "run"], "task: the run was started with 'shapematch', got 'run'"),
+        (["--gamma", "0.5"], "gamma: the run was started with 0.95, got 0.5"),
+        (["--config", str(tmp_path / "new.json")], "gamma: the run was started with 0.95, got 0.5"),
+        (["--eval-episodes", "9"], "eval_episodes: the run was started with 2, got 9"),
+        (["--learner", "analytic"], "algo must be 'cfp-sac', that of the run"),
+    ):
+        assert resume(finished, *options) == 2
+        assert named in capsys.readouterr().err
+    changed = "--steps 160 --backend eager --eval-every 7 --log-every 9 --no-video".split()
+    assert parse(["--resume", "--out", str(finished), *changed]).run.eval_every == 7
+    assert run(finished) == 2
+    assert "already holds a run" in capsys.readouterr().err
 
 
 def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_path, capsys):
     folder = tmp_path / "run"
-    assert run(folder, *"--resume --steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()) == 0
+    assert run(folder, "--resume", *SHORT) == 0
     assert "holds no run yet" in capsys.readouterr().out and (folder / "results.json").exists()
-    with at_step(44, lambda: signal.raise_signal(signal.SIGTERM)):
-        assert train.main(["--out", str(folder), "--resume", "--steps", "60"]) == 128 + signal.SIGTERM
+    with at_step(44, terminate):
+        assert resume(folder, "--steps", "60", "--eval-every", "8") == 128 + signal.SIGTERM
     assert not (folder / "results.json").exists()
-    assert train.main(["--out", str(folder), "--resume"]) == 0
+    assert resume(folder, "--eval-every", "0") == 0
     assert read_table(folder / "progress.csv")[-1]["step"] == "60" and (folder / "results.json").exists()
+    assert read_policy(folder / "policy.safetensors")[1]["steps"] == 60  # without evaluations the newest is kept
     before = {path: path.read_bytes() for path in folder.glob("*.json")}
     capsys.readouterr()
-    assert train.main(["--out", str(folder), "--resume", "--steps", "44"]) == 2
+    assert resume(folder, "--steps", "44") == 2
     assert "steps must be at least 60, those that the run has taken, got 44" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.glob("*.json")} == before
 
 
-def test_resuming_nothing_is_an_error_unless_a_task_is_named(tmp_path, capsys):
-    assert train.main(["--out", str(tmp_path / "none"), "--resume"]) == 2
-    assert "none holds no run to resume; name a --task to start one there" in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
-
-
-def test_without_evaluations_the_newest_policy_is_kept(tmp_path):
-    folder, policy = tmp_path / "run", tmp_path / "run" / "policy.safetensors"
-    assert run(folder, *"--steps 40 --handover 20 --eval-every 8 --eval-episodes 1".split()) == 0
-    assert train.main(["--out", str(folder), "--resume", "--steps", "60", "--eval-every", "0"]) == 0
-    assert read_policy(policy)[1]["steps"] == 60
-
-
-def test_help_names_the_program_that_was_started(monkeypatch, capsys):
-    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)  # as in a script
-    monkeypatch.setattr(sys, "argv", ["pit.py", "--out", ".", "--bad"])
-    with pytest.raises(SystemExit):
-        train.main()
-    assert "python pit.py --help" in " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert program_name("cfp.train", []) == "python -m cfp.train"
-
-
-def test_video_and_replay_or_how_to_install(finished, tmp_path, monkeypatch, capsys):
-    films = "--size 128 --rate 20 --video".split()
-    arguments = [str(finished), "--episodes", "1", "--json", *films, str(tmp_path / "film.mp4")]
-    monkeypatch.setattr("dittogym.render.film.find_spec", lambda name: None)
-    assert evaluate.main([*arguments, "--replay", str(tmp_path / "replay.html")]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)[-1]["policy"] == "stage 2" and "pip install 'torchmpm[video]'" in told.err
-    assert f"replay: {tmp_path / 'replay.html'}" in told.err and (tmp_path / "replay.html").stat().st_size > 10_000
-    monkeypatch.undo()
-    imageio = pytest.importorskip("imageio.v2")
-    pytest.importorskip("imageio_ffmpeg")
-    assert evaluate.main(arguments) == 0
-    assert capsys.readouterr().err.strip() == f"video: {tmp_path / 'film.mp4'}"
-    with imageio.get_reader(tmp_path / "film.mp4") as film:
-        metadata = film.get_meta_data()
-    assert metadata["codec"].startswith("h264") and tuple(metadata["size"]) == (128, 128) and metadata["fps"] == 20
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--video film.html", "video must end in .mp4 or .gif or .webp or .png, got film.html"),
-        ("--video film.avi", "video must end in .mp4 or .gif or .webp or .png, got film.avi"),
-        ("--replay film.mp4", "replay must end in .html, got film.mp4"),
-        ("--video film.mp4 --size 3", "size must be at least 16, got 3"),
-    ],
-)
-def test_files_of_films_are_checked_first(options, message, capsys):
-    assert evaluate.main(["no/such/folder", *options.split()]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_evaluation_is_not_haunted_by_the_one_before():
-    """The environments of an evaluation have nothing before."""
-    config = replace(sac_preset("shapematch"), seed=3)
-    environment = replace(config.environment, particles=100, substeps=1, num_envs=2)
-    config = replace(config, environment=environment)
-    policy = ActorPolicy(ActorSpec((8,)), True)
-    policy.description = {}
-    once, twice = compare(config, {"a": policy}, 2), compare(config, {"a": policy, "b": policy}, 2)
-    assert once[-1].returns == twice[-2].returns == twice[-1].returns
-
-
-def test_evaluation_of_a_folder(finished, capsys):
-    assert evaluate.main([str(finished), "--episodes", "2", "--json", "--device", "cpu"]) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert rows == json.loads((finished / "results.json").read_text())
-    assert evaluate.main([str(finished), "--episodes", "1"]) == 0
-    table = capsys.readouterr().out
-    assert "stage 2" in table and "± std" in table
-
-
-def test_evaluation_with_and_without_noise(finished, capsys):
-    rows = {}
-    for noise in ("with", "without", "both"):
-        arguments = [str(finished), "--episodes", "2", "--json", "--device", "cpu", "--noise", noise]
-        assert evaluate.main(arguments) == 0
-        rows[noise] = {row.pop("policy"): row for row in json.loads(capsys.readouterr().out)[2:]}
-    assert list(rows["both"]) == [f"stage {stage}, {how}" for stage in (1, 2) for how in ("noisy", "mean")]
-    for stage in ("stage 1", "stage 2"):
-        assert rows["both"][f"{stage}, noisy"] == rows["with"][stage]
-        assert rows["both"][f"{stage}, mean"] == rows["without"][stage]
-    assert rows["with"] != rows["without"]
-    assert rows["with"]["stage 1"]["interval"] > 0
-
-
-def test_evaluation_of_a_single_policy_is_that_of_its_run(finished, capsys):
-    common = ["--episodes", "2", "--json", "--device", "cpu"]
-    assert evaluate.main(["--policy", str(finished / "policy.safetensors"), *common]) == 0
-    alone = json.loads(capsys.readouterr().out)
-    assert evaluate.main([str(finished), *common]) == 0
-    run = json.loads(capsys.readouterr().out)
-    assert alone[-1] | {"policy": "stage 2"} == run[-1]
-    assert evaluate.main([str(finished), *common, "--particles", "60"]) == 0
-    other = json.loads(capsys.readouterr().out)
-    assert [row["mean"] for row in other] != [row["mean"] for row in run]
-
-
-def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch):
-    monkeypatch.setattr("dittogym.tasks.TASKS", dict(dittogym.TASKS))
-    monkeypatch.setattr("dittogym.registration.TASKS", dittogym.tasks.TASKS)
-    tens = replace(dittogym.make_spec("run"), name="tens", coarse=10, fine=20, horizon=2)
-    dittogym.register("tens", lambda: tens)
-    environment = EnvironmentConfig(particles=60, substeps=1)
-    config = replace(sac_preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
-    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(3)), config, 3, 0)
-    command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
-    opened, _ = command.open(train.PROGRAM)
-    assert (opened.resolutions, opened.gate_bias) == (config.resolutions, config.gate_bias)
-    assert "policy" in evaluate.run(train.PROGRAM, command)
-
-
-def test_policies_with_parity_in_their_header_act_as_they_did(tmp_path):
-    config = sac_preset("shapematch", "paper")
-    config = replace(config, environment=replace(config.environment, parity="reference"))
-    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), config, 1, 0)
-    for particles in (None, "full", "lite", 60):
-        chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
-        environment = chosen.open(train.PROGRAM)[0].environment
-        assert environment.particles == (particles or "full")
-        assert environment.action_indexing == "grid"  # as the policy acts
-
-
-@pytest.mark.parametrize("name", shipped())
-def test_shipped_policy_acts_in_its_task(name):
-    policy = cfp.load(name)
-    task = policy.description["task"]
-    assert name in (task, f"{task}-success") and policy_file(name).stat().st_size < 1_000_000
-    assert json.loads(policy_file(name).with_suffix(".json").read_text()) == policy.description
-    env = dittogym.TorchEnv(task, resolution=policy.resolution, particles=100, substeps=1)
-    observation, _ = env.reset(seed=0)
-    action, _ = policy.predict(observation.numpy())
-    assert action.shape == (1, *env.action_shape) and np.abs(action).max() <= 1
-
-
-def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch, capsys):
-    """Each time as in a process that has not seen the module. Loading a policy imports nothing, evaluating it does."""
-    monkeypatch.syspath_prepend(tmp_path)
+def test_the_folder_to_resume_follows_from_the_options_that_name_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dittogym.tasks.TASKS", dict(dittogym.TASKS))
-    monkeypatch.setattr("dittogym.registration.TASKS", dittogym.tasks.TASKS)
-    (tmp_path / "bouncing.py").write_text(
-        "import dataclasses, dittogym\n"
-        "def bounce(): return dataclasses.replace(dittogym.make_spec('run'), name='bounce', horizon=20)\n"
-        "dittogym.register('bounce', bounce)"
-    )
+    assert resume("none") == 2
+    assert "none holds no run to resume; name a --task to start one there" in capsys.readouterr().err
+    folder = tmp_path / "runs" / "cfp-sac-shapematch-quick-3"
+    assert run(folder, "--seed", "3", *ONE_STAGE, "--steps", "20") == 0
+    again = parse("--task shapematch --learner sac --seed 3 --resume".split())
+    assert (again.out, again.run.steps) == (folder.relative_to(tmp_path), 20)
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
-    def forget():
-        sys.modules.pop("bouncing", None)
-        dittogym.tasks.TASKS.pop("bounce", None)
 
-    folder = tmp_path / "runs" / "cfp-bounce-quick-0"
-    short = "--steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()
-    assert train.main([*TINY, *short, "--task", "bouncing:bounce"]) == 0
-    forget()
-    policy = cfp.load(folder)
-    assert policy.description["task"] == "bouncing:bounce" and "bouncing" not in sys.modules
-    capsys.readouterr()
-    for what, name in (([str(folder)], "stage 2"), (["--policy", str(folder / "policy.safetensors")], "policy")):
-        forget()
-        assert evaluate.main([*what, "--episodes", "1"]) == 0
-        printed = capsys.readouterr()
-        assert f"\n{name} " in printed.out and "has changed" not in printed.err
-    forget()
-    with (tmp_path / "bouncing.py").open("a") as file:
-        file.write("\n# another task now")
-    assert evaluate.main([str(folder), "--episodes", "1"]) == 0
-    assert "a file of task 'bouncing:bounce' has changed since the policy was trained" in capsys.readouterr().err
-    forget()
-    (tmp_path / "bouncing.py").unlink()
-    sys.path_importer_cache.clear()
-    assert evaluate.main([str(folder), "--episodes", "1"]) == 2
-    assert "No module named 'bouncing'" in capsys.readouterr().err
+def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):
+    def fail():
+        raise OSError("no space left on device")
+
+    with at_step(14, fail):
+        assert run(tmp_path / "run", *SHORT) == 1
+    assert run(tmp_path / "run", *SHORT) == 0
+    assert "holds no checkpoint: starting from the beginning" in capsys.readouterr().out
+    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10", "20", "30", "40"]
+    shutil.rmtree(tmp_path / "run" / "checkpoint")  # a finished run is not started anew
+    assert run(tmp_path / "run", "--resume", *SHORT) == 2
+    assert "the run is finished, but its checkpoint is missing" in capsys.readouterr().err
+
+
+def test_a_training_that_diverges_says_that_its_checkpoint_is_whole(finished, tmp_path, capsys):
+    folder, on_step = tmp_path / "run", callbacks.StopCallback._on_step
+
+    def act(callback):
+        if callback.stage.step == 50:
+            next(callback.stage.learner.policy.actor.parameters()).data.fill_(torch.nan)
+        return on_step(callback)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callbacks.StopCallback, "_on_step", act)
+        assert run(folder) == 1
+    assert "; the last checkpoint is untouched" in capsys.readouterr().err
+    assert resume(folder) == 0
+    assert_same_run(folder, finished)
+
+
+@contextmanager
+def small_files():
+    """No file may grow beyond a mebibyte: a state no longer fits."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.slow
+def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_path, capsys):
+    folder = tmp_path / "run"
+    with small_files() as fill, at_step(50, fill):
+        assert run(folder) == 1
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith(f"error: [Errno 27] File too large: '{folder}")
+    assert not list(folder.rglob("*.part"))
+    assert resume(folder) == 0
+    assert_same_run(folder, finished, TABLES)
+
+
+@pytest.mark.parametrize("changes", [{"task": "run"}, {"resolution": 16}])
+def test_policy_of_another_run_is_refused(finished, tmp_path, capsys, changes):
+    path = shutil.copytree(finished, tmp_path / "run") / "policy.safetensors"
+    tensors, description = read_policy(path)
+    write_policy(path, tensors, description | changes)
+    assert evaluate.main([str(tmp_path / "run"), "--episodes", "1", "--device", "cpu"]) == 2
+    error = capsys.readouterr().err
+    assert f"{path}: " in error and str(next(iter(changes.values()))) in error and "stage 2 of this run" in error
+
+
+def test_first_stage_of_other_resolutions_is_refused(finished, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert run(folder, *SHORT, "--resolutions", "8", "16") == 0
+    for suffix in ("safetensors", "json"):
+        (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
+    assert resume(folder, "--steps", "50") == 2
+    assert "stage1.safetensors: weights and description do not match" in capsys.readouterr().err
 
 
 def test_page_shows_the_run_and_opens_from_disk(finished):
@@ -341,40 +270,17 @@ def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
     pixels = np.full((90, 200, 3), 255, np.uint8)
     pixels[30:60, 20:120] = 0
     drawing.write_bytes(png(pixels))
-    options = ["--video", "--target", str(drawing), "--eval-every", "0", "--eval-episodes", "1", "--seed", "3"]
-    assert run(folder, *options, "--steps", "40", "--handover", "20") == 0
+    assert run(folder, *SHORT, "--video", "--target", str(drawing), "--seed", "3") == 0
     assert f"target: {folder / 'target.png'}" in capsys.readouterr().out
     target = load_target(drawing)
     assert np.array_equal(load_target(folder / "target.png"), target) and np.ptp(np.argwhere(target), 0)[1] > 30
     page = (folder / "index.html").read_text()
     for part in ('poster="poster.png"', 'href="replay.html"', "Intersection over union", "No evaluation was made"):
         assert part in page
-    cells = "".join(f'<td class="text">{cell}</td>' for cell in ("environment.particles", "100", "lite"))
+    cells = "".join(f'<td class="text">{cell}</td>' for cell in ("particles", "100", "lite"))
     assert page.count("data:image/png") == 3 and cells in page
-    assert "environment.dtype</td>" not in page and f"torchmpm {torchmpm.__version__}" in page
+    assert ">dtype</td>" not in page and f"torchmpm {torchmpm.__version__}" in page
     assert (folder / "poster.png").stat().st_size > 1000 and (folder / "replay.html").stat().st_size > 10_000
-    command = html.unescape(re.sub("</?span>", "", re.search("<pre>(<span>python<.*)</pre>", page)[1]))
-    again = parse(train.PROGRAM, shlex.split(command)[3:]).run
-    assert to_json(again) == json.loads((folder / "config.json").read_text(), object_hook=with_tuples)
-
-
-def with_tuples(values):
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-
-
-def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):
-    def fail():
-        raise OSError("no space left on device")
-
-    options = "--steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()
-    with at_step(14, fail):
-        assert run(tmp_path / "run", *options) == 1
-    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10"]
-    assert run(tmp_path / "run", *options) == 0
-    assert "holds no checkpoint: starting from the beginning" in capsys.readouterr().out
-    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10", "20", "30", "40"]
-    assert run(tmp_path / "run", *options) == 2
-    assert "already holds a run" in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "run" / "checkpoint")  # a finished run is not started anew
-    assert run(tmp_path / "run", "--resume", *options) == 2
-    assert "the run is finished, but its checkpoint is missing" in capsys.readouterr().err
+    command = html.unescape(re.sub("</?span>", "", re.search("<pre>(<span>torchmpm<.*)</pre>", page)[1]))
+    again = parse(shlex.split(command)[2:]).run
+    assert json.loads(json.dumps(to_json(again))) == json.loads((folder / "config.json").read_text())

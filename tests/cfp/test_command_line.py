@@ -1,0 +1,165 @@
+"""Command lines: options, help, ``--dry-run``, exit codes and error lines, warnings before a training."""
+
+import dataclasses
+import json
+import os
+import re
+import shlex
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import baselines.train
+from cfp import registry, train
+from cfp.errors import CheckpointError, ConfigError, NonFiniteError
+from cfp.evaluation.page import command_words
+from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.process import Stopped
+from cfp.experiment.training import parse
+from cfp.presets import like_start, sac_preset
+
+TINY = "--learner sac --particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
+
+
+def test_command_line_beats_file_beats_preset(tmp_path):
+    file = tmp_path / "options.json"
+    file.write_text(json.dumps({"task": "run", "algo": "cfp-sac", "gamma": 0.5, "tau": 0.25, "video": True}))
+    command = parse(["--config", str(file), *"--gamma 0.75 --no-video --particles 500 20 --out x".split()])
+    own = {"gamma": 0.75, "tau": 0.25, "video": False, "particles": (500, 20)}
+    assert command.run == replace(sac_preset("run"), **own) and command.out == Path("x")
+    assert parse(["--particles", "full"]).run.particles == "full"
+    assert parse(["--task", "run"]).out == Path("runs/cfp-analytic-run-quick-0")
+    assert parse("--task run --learner sac --seed 4".split()).out == Path("runs/cfp-sac-run-quick-4")
+    assert parse("--preset paper --task dig".split()).run == sac_preset("dig", "paper")
+
+
+def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert train.main([*TINY, "--dry-run"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert registry.configure(printed) == parse(TINY).run
+    assert (printed["steps"], printed["handover"], printed["particles"]) == (400, [0.75], 100)
+    assert train.main([*TINY, "--task", "run", "--resume", "--dry-run"]) == 0
+    assert json.loads(capsys.readouterr().out)["task"] == "run"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", ["--task dig", "--task slot --learner sac", "--algo gnn-16", "--algo shac"])
+def test_help_shows_each_option_once_with_its_description_and_the_task_s_own_value(words, capsys):
+    config = parse(words.split(), "baselines.train").run
+    with pytest.raises(SystemExit):
+        baselines.train.main([*words.split(), "--help"])
+    shown = capsys.readouterr().out
+    lines = [line.strip("│| ") for line in shown[shown.index("-h, --help") :].splitlines()]
+    entries = " ".join(f"\n{line}" if re.match("--[a-z]", line) else line for line in lines).splitlines()[1:]
+    names = [entry.split()[0].strip("-,").replace("-", "_") for entry in entries]
+    own = [option.name for option in dataclasses.fields(config)]
+    assert sorted(names) == sorted([*own, "learner", "out", "resume", "config", "dry_run"])
+    for name, entry in zip(names, entries, strict=True):
+        assert re.search(r"[A-Za-z]+ [a-z]+.*\(default: ", entry), f"{name} is not described"
+        if name in own:
+            value = getattr(config, name)
+            told = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            assert f"(default: {told})" in entry
+    assert "Algorithms: cfp-analytic, cfp-sac" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [("--learner sac --algo cfp-analytic", "learner"), ("--algo ppo", "algo"), ("--out ''", "out"), ("--out=", "out")],
+)
+def test_word_that_cannot_be_used_is_named_in_one_line(words, named, capsys):
+    assert train.main(shlex.split(words)) == 2
+    assert re.fullmatch(rf"error: {named} must .*\n", capsys.readouterr().err)
+
+
+def test_help_names_the_program_that_was_started(monkeypatch, capsys):
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)  # as in a script
+    monkeypatch.setattr(sys, "argv", ["pit.py", "--out", ".", "--bad"])
+    with pytest.raises(SystemExit):
+        train.main()
+    assert "python pit.py --help" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert program_name("cfp.train", []) == "python -m cfp.train"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--task run --steps 16000 --handover 0.6",
+        "--task kick --learner sac --steps 19200 --critics-first 0.1 --no-video",
+        "--task run --learner sac --start-from run --batch-size 128",
+        "--task run --start-from run --refine --action-step 0.05 --resolutions 8 --seed 3",
+        "--algo gnn-16 --task run --steps 19200",
+    ],
+)
+def test_the_command_that_repeats_a_run(words):
+    """Some options follow from others; they are named where they do not."""
+    config = parse(words.split()).run
+    preset = registry.find(config.algo).preset(config.task, config.preset)
+    start = {name: getattr(config, name, None) for name in ("start_from", "refine")}
+    assert parse(command_words(config, like_start(preset, start))[2:]).run == config
+
+
+@pytest.mark.parametrize(
+    ("words", "lines"),
+    [
+        ("--handover 0.5", ["stage 1: all its 200 steps are random", "stage 2: no update in its 200 steps"]),
+        ("--random-steps 9 0 --update-start 50", []),
+        ("--algo cfp-analytic --task run --steps 6000", ["stage 2: only the critic learns in its 1,500 steps"]),
+        ("--algo cfp-analytic --task run --steps 9000", []),
+    ],
+)
+def test_stages_that_learn_nothing_are_named(words, lines, tmp_path):
+    config = parse(words.split() if "algo" in words else [*TINY, *words.split()]).run
+    for first in (1, 2):
+        told = registry.find(config.algo).warnings(config, tmp_path, first)
+        assert [line.split(" (")[0] for line in told] == [line for line in lines if first == 1 or "stage 2" in line]
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ConfigError("steps: got 0"), 2),
+        (CheckpointError("state.pt: damaged"), 2),
+        (NonFiniteError("the loss became nan"), 1),
+        (OSError("No space left on device"), 1),
+        (MemoryError("backend"), 1),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 1),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"), 1),
+    ],
+)
+def test_expected_error_is_one_line_and_an_exit_code(capsys, error, code):
+    def command():
+        raise error
+
+    assert run_command(command) == code
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    assert str(error) in captured.err
+
+
+def test_exit_codes_of_programs_that_end_stop_or_fail(capsys):
+    def raises(error):
+        def command():
+            raise error
+
+        return command
+
+    assert run_command(lambda: None) == 0 and run_command(lambda: 1) == 1
+    assert run_command(raises(Stopped(signal.SIGTERM, "resume with: the same command"))) == 128 + signal.SIGTERM
+    assert capsys.readouterr().out == "stopped by SIGTERM; resume with: the same command\n"
+    assert run_command(raises(KeyboardInterrupt())) == 130
+    with pytest.raises(RuntimeError, match="a mistake"):  # keeps its traceback
+        run_command(raises(RuntimeError("a mistake in the program")))
+
+
+def test_output_that_nobody_reads_any_more_is_no_error(monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as output:  # buffered, as that of a program in a pipe
+        monkeypatch.setattr(sys, "stdout", output)
+        assert run_command(lambda: print("a few words")) == 141
