@@ -27,6 +27,7 @@ from dittogym.observation import SIZE
 
 Interpolation = Literal["half_pixel", "aligned"]
 EncoderKind = Literal["paper", "small"]
+ENCODERS: tuple[EncoderKind, ...] = get_args(EncoderKind)
 
 #: Rows and columns of the observation, and of actions as input of the paper's encoders.
 IMAGE_SIZE = SIZE
@@ -82,6 +83,8 @@ class ActorSpec:
 
     def __post_init__(self) -> None:
         """Check that the fields match each other."""
+        if self.encoder not in ENCODERS:
+            raise ConfigError(f"encoder must be {' or '.join(ENCODERS)}, got {self.encoder!r}")
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
             given = f"{self.resolutions}; by default they follow from the task's coarse and fine"

@@ -110,3 +110,11 @@ def make_trained(folder: Path) -> Path:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         assert train.main([*TINY.split(), "--out", str(folder)]) == 0
     return folder
+
+
+def table(rows, error=ValueError):
+    """Cases of calls in Python: rows of a name, a call, and words of the error."""
+    return [
+        Case(name, lambda desk, call=call: call(), words if isinstance(words, tuple) else (words,), error)
+        for name, call, words in rows
+    ]

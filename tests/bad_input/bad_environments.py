@@ -6,7 +6,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import torch
-from bad_arguments import table
+from bad_cases import table
 
 import dittogym
 from dittogym import TorchEnv, make_spec

@@ -14,6 +14,7 @@ PROGRAMS = {
     "evaluate": ("cfp.evaluate", "--device cpu "),
     "disturb": ("baselines.robustness", "--device cpu "),
     "compare": ("baselines.compare.__main__", NEW),
+    "rank": ("baselines.leaderboard", NEW),
 }
 
 
@@ -146,24 +147,20 @@ OTHERS = (
         ("--tasks swim", "task must be one of catch"),
         ("--algos alchemy", "algo must be one of cfp-analytic"),
         ("--seeds 1 1", "seeds must be one or more different values"),
-        ("--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray"),
-        ("--policies run", "policies requires protocol"),
-        ("--protocol v9", "--protocol", "'v9'"),
-        ("--protocol v1 --policies none", "none.safetensors: there is no policy"),
+        ("--gpus-per-run 0.5", "gpus_per_run requires --executor ray"),
         ("--plan none.json", "plan: none.json cannot be read"),
+    )
+    + rows(
+        "rank",
+        ("none", "none.safetensors: there is no policy"),
+        ("none.json", "none.json: cannot be read as JSON"),
     )
     + [
         planned([1], "plan: plan.json cannot be read as JSON"),
         planned({"colour": 1}, "must hold common, tasks and algos only, got colour"),
         planned({"common": {"seed": 5}}, "plan: common must not hold seed"),
         planned({"algos": {"cfp-sac": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp-sac.t"),
-        planned({"common": {"colour": 1}}, "zero on shapematch: colour is not an option"),
-        Case(
-            "rank a folder",
-            command(main_of("baselines.leaderboard.__main__"), "{folder}"),
-            ("cannot be read as JSON",),
-            Refused,
-        ),
+        planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "--colour"),
         Case(
             "evaluate an empty folder",
             command(main_of("baselines.evaluate"), "{folder}"),

@@ -91,7 +91,7 @@ def test_closed_gates_leave_the_coarsest_action(resolutions):
 @pytest.mark.parametrize("task", TASKS)
 def test_closed_gates_leave_the_coarsest_field(task):
     config = sac_preset(task, "quick")
-    config = replace(config, environment=replace(config.environment, particles=100, substeps=1, num_envs=2))
+    config = replace(config, particles=100, substeps=1, num_envs=2)
     several = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
     for resolutions in several:
         shut = replace(config, resolutions=resolutions, gate_bias=(-100.0,) * (len(resolutions) - 1))

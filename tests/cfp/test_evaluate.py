@@ -13,7 +13,6 @@ from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
-from cfp.train import PROGRAM
 from dittogym import TorchEnv
 
 
@@ -47,7 +46,7 @@ class Counting:
 def tiny(task="run", **environment):
     config = preset(task)
     options = {"particles": 200, "substeps": 2} | environment
-    return replace(config, device="cpu", environment=replace(config.environment, **options))
+    return replace(config, device="cpu", **options)
 
 
 def fake_trial(policy, episodes, batch=1, **options):
@@ -131,11 +130,11 @@ def test_an_episode_that_fails_ends_the_others():
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():
-    config, _ = Selection(policy="run", dt=2e-4).open(PROGRAM)
+    config, _ = Selection(policy="run", dt=2e-4).open()
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
     with pytest.raises(ConfigError, match="dt must divide"):
-        Selection(policy="run", dt=3e-4).open(PROGRAM)
+        Selection(policy="run", dt=3e-4).open()
 
 
 def test_the_seed_chooses_the_episodes():
-    assert [Selection(policy="run", seed=seed).open(PROGRAM)[0].seed for seed in (7, None)] == [7, 0]
+    assert [Selection(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]

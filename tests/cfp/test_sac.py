@@ -27,7 +27,7 @@ from cfp.sac.algorithm import METRICS, critic_target
 from cfp.sac.exploration import LONGEST, CellNoise
 
 ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
-LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
+SMALL = {"plain": ActorSpec((8,), encoder="small"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="small")}
 
 
 def make_model(spec, env=None, sac_options=None, **hyperparameters):
@@ -403,7 +403,7 @@ def test_robots_explore_with_the_noise_of_cells():
     assert inside.flatten(2).std(2).mean() < 0.2 * spread[-1]
 
 
-@pytest.mark.parametrize("spec", LEAN.values(), ids=LEAN)
+@pytest.mark.parametrize("spec", SMALL.values(), ids=SMALL)
 def test_the_critics_alone_train_the_shared_encoder(spec):
     size = spec.action_size
     model = make_model(spec, FakeEnv(num_envs=2, resolution=size))
@@ -425,7 +425,7 @@ def test_the_critics_alone_train_the_shared_encoder(spec):
 
 
 def test_encoder_of_a_refined_policy_stays():
-    model = make_model(LEAN["plain"], FakeEnv(num_envs=2, resolution=8))
+    model = make_model(SMALL["plain"], FakeEnv(num_envs=2, resolution=8))
     actor = model.networks()[0]
     model.trains_encoder = False
     before = {name: value.clone() for name, value in actor.state_dict().items()}
@@ -436,7 +436,7 @@ def test_encoder_of_a_refined_policy_stays():
 
 
 def test_average_of_weights_is_the_policy():
-    model = make_model(LEAN["plain"], FakeEnv(num_envs=2, resolution=8), weight_average=0.9)
+    model = make_model(SMALL["plain"], FakeEnv(num_envs=2, resolution=8), weight_average=0.9)
     expected = {name: value.clone() for name, value in model.networks()[0].state_dict().items()}
     for update in range(3):
         model.update(make_batch(8))
@@ -457,23 +457,23 @@ def test_halved_images_are_means_of_four_pixels():
     assert halved(expected) is expected
 
 
-def test_lean_policy_is_saved_and_loaded(tmp_path):
+def test_small_policy_is_saved_and_loaded(tmp_path):
     config = sac_preset("run", "quick")
     spec = config.actor_spec(2)
-    assert spec.encoder == "lean"
+    assert spec.encoder == "small"
     actor, images = build_actor(spec), make_batch(8).observations
     save_actor(tmp_path / "policy.safetensors", actor, config, 2, 5)
     loaded = load(tmp_path)
     assert loaded.spec == spec
     assert torch.equal(loaded(images, deterministic=True), actor(images, deterministic=True))
-    full = build_actor(replace(spec, encoder="full"))
+    full = build_actor(replace(spec, encoder="paper"))
     count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, full)]
     assert count[0] < 0.8 * count[1]
 
 
 @pytest.mark.parametrize("patch", [18, 32])
-def test_lean_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
-    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+def test_small_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="small")
     actor, images = build_actor(spec), make_batch(8).observations
     executed, learned = (sample(images, deterministic=True) for sample in (actor.sample, actor.sample_for_critic))
     assert (executed.action.shape[2:], learned.action.shape[2:]) == ((patch, patch), (8, 8))
@@ -481,13 +481,13 @@ def test_lean_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
         torch.testing.assert_close(one, other)
     coarse, residual, gate = learned.parts
     torch.testing.assert_close(learned.action, gate * residual + (1 - gate) * upsample(coarse, 8, "half_pixel"))
-    full = build_actor(replace(spec, encoder="full"))
+    full = build_actor(replace(spec, encoder="paper"))
     assert full.sample_for_critic(images).action.shape[2:] == (patch, patch)
 
 
 @pytest.mark.parametrize("patch", [8, 18])
 def test_batches_hold_actions_as_the_critics_take_them(patch):
-    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="small")
     model = make_model(spec, FakeEnv(num_envs=2, resolution=patch), update_start=4, batch_size=4)
     model.learn(24)
     batch = model.replay_buffer.sample(4)
@@ -507,7 +507,7 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
 
 
-def test_layers_of_lean_critics_bound_the_values_of_inputs_never_seen():
+def test_layers_of_small_critics_bound_the_values_of_inputs_never_seen():
     critics, image, features = SmallCritics(8), torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4)
     actions = torch.randn(3, 2, 8, 8)
     large, larger = (critics(Encoded(image, scale * features), scale * actions) for scale in (1e3, 1e4))
