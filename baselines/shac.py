@@ -19,9 +19,8 @@ from cfp.agent.actor import LATENT, Actor, ActorSpec, Encoder, initialise
 from cfp.analytic.critic import BETAS, Critic, StateFeatures, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig, WindowConfig
-from cfp.envs.make import choose_device, make_env
-from cfp.envs.seeding import seeded
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.envs.make import choose_device, make_env, seeded
+from cfp.errors import ConfigError, NonFiniteError, check_at_least
 from cfp.experiment.folder import start_path
 from cfp.learner import Learner, NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
 from cfp.policy import (
@@ -36,7 +35,6 @@ from cfp.policy import (
     write_policy,
 )
 from cfp.presets import ON_SPEED, sac_preset
-from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 

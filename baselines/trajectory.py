@@ -13,11 +13,10 @@ from baselines.common.open_loop import OpenLoop, OpenLoopLearner
 from baselines.common.rollout import check_differentiable
 from cfp.config import EnvironmentConfig, Particles, RunConfig
 from cfp.envs.make import make_torch_env
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.errors import ConfigError, NonFiniteError, check_at_least, check_positive
 from cfp.experiment.folder import policy_path
 from cfp.learner import FINAL_FRACTION, Resumable, Scalars, Sees
 from cfp.presets import sac_preset
-from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv, make_spec
 from dittogym.action import bicubic
 from dittogym.observation import soft_silhouette

@@ -23,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 import dittogym  # noqa: F401  (registers the environments)
 from cfp import CFP, CFPPolicy, SACConfig
 from cfp.envs.make import make_env
-from cfp.experiment.process import keep_memory
+from cfp.experiment.cli import keep_memory
 from cfp.presets import sac_preset
 
 

@@ -13,8 +13,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 import dittogym.tasks
 from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
-from cfp.errors import ConfigError
-from cfp.validation import brief, check_at_least, check_decay, check_fraction, check_positive
+from cfp.errors import ConfigError, brief, check_at_least, check_decay, check_fraction, check_positive
 from dittogym import make_spec
 from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec

@@ -15,14 +15,13 @@ import tyro
 from cfp import registry
 from cfp.config import Particles, RunConfig, StagedConfig
 from cfp.envs.make import choose_device
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CheckpointError, ConfigError, check_at_least
 from cfp.evaluation.returns import Noise, compare, evaluation_seed, format_table, to_rows, without_noise
 from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config
 from cfp.files import check_output
 from cfp.policy import Policy, environment_of, is_of_another_task, policy_file, shipped
-from cfp.validation import check_at_least
 from dittogym.trajectories import Episode, record, save_episodes
 
 EXAMPLES = (

@@ -24,8 +24,8 @@ from cfp.agent.actor import Actor, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
+from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import policy_path, start_path
-from cfp.experiment.process import StopSignals
 from cfp.policy import (
     KIND,
     ActorPolicy,

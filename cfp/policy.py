@@ -25,10 +25,9 @@ from torch import Tensor, nn
 
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
 from cfp.hub import SCHEME, Shareable, download
-from cfp.validation import brief
 from dittogym import make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from cfp.config import RunConfig
 from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, reason_without_effect
 from cfp.envs.make import batch_size
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_at_least
 from cfp.evaluate import Selection
 from cfp.evaluation.page import write_figure
 from cfp.evaluation.returns import Result, Trial, decision_grid, evaluate, evaluation_seed, numbers
@@ -23,7 +23,6 @@ from cfp.experiment.folder import Folder
 from cfp.files import write_json, write_text
 from cfp.policy import Policy
 from cfp.tables import Column, Table
-from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
 
 EXAMPLES = ("runs/run", "--policy run --cases noise gravity --out runs/noise")

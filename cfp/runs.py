@@ -12,8 +12,8 @@ from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.video import record_policy
+from cfp.experiment.cli import Stopped, keep_memory
 from cfp.experiment.folder import parse_folder, policy_path, read_config
-from cfp.experiment.process import Stopped, keep_memory
 from cfp.experiment.training import from_python, train
 from cfp.files import parse_json
 from cfp.hub import Shareable

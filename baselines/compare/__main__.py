@@ -13,10 +13,9 @@ from baselines.compare.plan import Run, make_runs, read_plan
 from baselines.compare.processes import LocalExecutor, Outcome, RayExecutor, Resources, execute
 from baselines.compare.report import read_result, write_report
 from cfp.config import Preset
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_at_least
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
-from cfp.validation import check_at_least
 
 EXAMPLES = (
     "--tasks shapematch --algos zero cfp-analytic shac --seeds 0 1 2",

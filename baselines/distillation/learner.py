@@ -6,7 +6,6 @@ By dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, th
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -28,13 +27,11 @@ from cfp.analytic.critic import descend
 from cfp.analytic.window import Episodes
 from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
 from cfp.envs import disturbances
-from cfp.envs.make import choose_device, make_env, make_torch_env
-from cfp.envs.seeding import seeded
-from cfp.errors import CheckpointError, ConfigError, NonFiniteError
+from cfp.envs.make import choose_device, make_env, make_torch_env, seeded
+from cfp.errors import CheckpointError, ConfigError, NonFiniteError, check_at_least, check_fraction, check_positive
+from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import policy_path
-from cfp.experiment.process import StopSignals
 from cfp.experiment.run import TrainingRun
-from cfp.files import read_json, write_json
 from cfp.hub import is_address
 from cfp.learner import (
     CoarseToFine,
@@ -48,7 +45,6 @@ from cfp.learner import (
 )
 from cfp.policy import copy_policy, load, read_policy, shipped
 from cfp.presets import sac_preset
-from cfp.validation import check_at_least, check_fraction, check_positive
 from dittogym import TorchEnv, make_spec
 from dittogym.spec import DT
 from torchmpm import tree
@@ -389,9 +385,15 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         descend(self.adam, self.config.max_grad_norm, "student's loss")
         return value
 
-    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Any]:
-        """Act, see stable-baselines3's ``predict``; actions are enlarged to the grid of the algorithm's environment."""
-        actions, state = self.trained_policy.predict(observation, *args, **kwargs)
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Act on an ``observation``, see stable-baselines3's ``predict``: without noise if ``deterministic``.
+
+        Actions are enlarged to the grid of the algorithm's environment; ``state`` is returned as it is, and
+        ``episode_start`` has no effect, as the policy has no memory.
+        """
+        actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
         patch = self.config.make_spec().patch
         return project(torch.from_numpy(actions), patch, patch).numpy(), state
 
@@ -468,7 +470,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
 
     @classmethod
     def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
-        """Train a teacher of which only the algorithm is named; what this took adds up in ``teacher/cost.json``."""
+        """Train a teacher of which only the algorithm is named, in the folder ``teacher``."""
         if config.teacher not in TRAINED or teacher_path(folder).exists():
             return
         chosen = configure({"algo": config.teacher, "task": config.task})
@@ -477,15 +479,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         algorithm, own = find(config.teacher), folder / "teacher"
         run = TrainingRun(algorithm, chosen, own, True, signals)
         print(f"training the teacher first: {config.teacher} -> {own}")
-        start, begin = run.step, time.perf_counter()
-        try:
-            run.train()
-        finally:
-            cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
-            cost["evaluation_seconds"] = run.evaluation_seconds
-            path = own / "cost.json"
-            before = read_json(path) if path.exists() else {}
-            write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
+        run.train()
         copy_policy(policy_path(own), teacher_path(folder))
 
     @classmethod

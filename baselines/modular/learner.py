@@ -13,12 +13,11 @@ from baselines.modular.segments import Nodes, SegmentedEnv
 from cfp.config import Hyperparameters, LearningConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_at_least, check_decay
 from cfp.learner import Sees
 from cfp.presets import sac_preset
 from cfp.sac.learner import SACLearner
 from cfp.sac.policies import NetworkPolicy
-from cfp.validation import check_at_least, check_decay
 from dittogym import make_spec
 
 

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from baselines.common.rollout import StepFunction, check_differentiable, rollout, soft_step
 from cfp.analytic.reward import split_cost
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_at_least
 from cfp.learner import Resumable
-from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.core import EnvState, Model, StepResult
 from dittogym.rewards import features_of

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
-from cfp.errors import ConfigError
-from cfp.validation import check_decay, check_positive
+from cfp.errors import ConfigError, check_decay, check_positive
 from dittogym import core
 from dittogym.action import bicubic
 from dittogym.core import EnvState

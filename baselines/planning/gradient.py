@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig, where_simulation
-from cfp.validation import check_positive
+from cfp.errors import check_positive
 from dittogym.core import EnvState
 
 

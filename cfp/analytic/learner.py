@@ -18,8 +18,7 @@ from cfp.analytic.critic import Critic, StateFeatures, mlp
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import AnalyticConfig, of_stage
-from cfp.envs.make import choose_device, make_env
-from cfp.envs.seeding import seeded
+from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
 from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, linear_decay, refines

@@ -1,7 +1,9 @@
-"""Environments from the options of a run."""
+"""Environments from the options of a run, and its random numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -50,3 +52,11 @@ def batch_size(config: RunConfig, episodes: int) -> int:
 def on_cpu(config: RunConfig) -> bool:
     """Whether a run simulates on a CPU."""
     return torch.device(choose_device(config.device)).type == "cpu"
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch's generators of all devices, and restore them afterwards."""
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+        torch.manual_seed(seed)
+        yield

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,15 @@ from cfp.experiment.callbacks import (
     FilmCallback,
     LogCallback,
     ProgressBarCallback,
+    ProgressTable,
     Stage,
     StopCallback,
+    Tracker,
+    check_trackers,
 )
 from cfp.experiment.checkpoint import Checkpoint, check_same
+from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import holds_progress, holds_run, policy_files, policy_path
-from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
-from cfp.experiment.process import StopSignals
 from cfp.files import read_json, write_atomically, write_json
 from cfp.learner import Learner
 from cfp.policy import copy_policy, is_of_another_task, read_policy
@@ -70,8 +71,6 @@ class TrainingRun:
             )
         self.learner, self.config, self.folder, self.signals = learner, config, folder, signals
         self.stages = len(config.ends())
-        self.preparation_seconds = 0.0  # before the first stage, in this session
-        self.evaluation_seconds = 0.0  # in this session
         self.seconds = 0.0  # wall time of all sessions, known after training
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
@@ -131,12 +130,8 @@ class TrainingRun:
         """Train the stages that are left."""
         for line in self.learner.warnings(self.config, self.folder, self.stage):
             print(line)
-        start = time.perf_counter()
         try:
-            try:
-                self.learner.prepare(self.config, self.folder, self.signals)
-            finally:
-                self.preparation_seconds = time.perf_counter() - start
+            self.learner.prepare(self.config, self.folder, self.signals)
             for number in range(self.stage, self.stages + 1):
                 self.stage = number
                 due = self.state is not None and self.state.get("evaluation_due", False)
@@ -189,8 +184,6 @@ class TrainingRun:
         try:
             stage.learner.learn(stage.steps_left, callbacks, None, reset_num_timesteps=False)
         finally:
-            self.step = stage.step
-            self.evaluation_seconds += evaluation.seconds
             bar.bar.close()
 
     def finish(self) -> None:

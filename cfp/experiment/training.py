@@ -18,9 +18,8 @@ import dittogym
 from cfp import registry
 from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, read_command, run_command
+from cfp.experiment.cli import Stopped, StopSignals, program_name, read_command, run_command
 from cfp.experiment.folder import Folder, folder_option, holds_run, read_config, run_lock
-from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 

@@ -1,6 +1,7 @@
 """Whatever is in a file of options, a picture or a policy: the documented errors come out, or what it says."""
 
 import json
+import resource
 from dataclasses import replace
 
 import cv2
@@ -15,7 +16,6 @@ from baselines.registry import ALGORITHMS, configure, find
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.process import peak_memory
 from cfp.policy import write_policy
 from cfp.presets import sac_preset
 from dittogym.tasks.targets import load_target
@@ -40,9 +40,9 @@ JSON = st.recursive(
 
 @pytest.fixture(autouse=True)
 def bounded_memory():
-    before = peak_memory()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
-    assert peak_memory() - before < LARGEST_GROWTH
+    assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) < LARGEST_GROWTH
 
 
 def paths(values, prefix=()):

@@ -1,6 +1,5 @@
 """Distillation into the image networks, on robots of a few hundred particles."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -287,8 +286,6 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     assert distill.main([*TINY, "--teacher", "shac", "--out", str(folder)]) == 0
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()
     assert (folder / "teacher.safetensors").read_bytes() == trained
-    cost = json.loads((folder / "teacher" / "cost.json").read_text())
-    assert cost["steps"] == 32 and cost["seconds"] > 0 == cost["evaluation_seconds"]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,7 @@ import baselines.train
 from cfp import registry, train
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.page import command_words
-from cfp.experiment.cli import program_name, run_command
-from cfp.experiment.process import Stopped
+from cfp.experiment.cli import Stopped, program_name, run_command
 from cfp.experiment.training import parse
 from cfp.presets import like_start, sac_preset
 

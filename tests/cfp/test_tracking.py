@@ -13,8 +13,7 @@ from tiny_runs import assert_same_run, resume, run
 from cfp.agent.actor import ActorSpec, build_actor
 from cfp.analytic.learner import METRICS as ANALYTIC_METRICS
 from cfp.evaluation.page import PICTURES, muscles, policy_pictures
-from cfp.experiment.callbacks import EVALUATION_COLUMNS, LOG_METRICS
-from cfp.experiment.loggers import EVALUATION_METRICS
+from cfp.experiment.callbacks import EVALUATION_COLUMNS, EVALUATION_METRICS, LOG_METRICS
 from cfp.sac.algorithm import METRICS
 from cfp.sac.learner import ROLLOUT_METRICS
 from cfp.tables import read_table

@@ -130,7 +130,7 @@ class Snow(Elastic):
     def resolved_stress(self, F: Mat2, Jp: Tensor, stable: Value) -> Sym2:
         """As :meth:`stress`, with the derivative in F of a stiffness of at most ``stable``, (B, N) or a number, Pa.
 
-        All other derivatives are exact.
+        All other derivatives, that in Jp among them, are exact.
         """
         tau = self.stress(F, Jp)
         if self.exact_gradients:
