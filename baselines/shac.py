@@ -269,11 +269,17 @@ class Shac(Resumable, UpdateLoop, Learner):
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
 
-    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Any]:
-        """Act, see stable-baselines3's ``predict``; a policy of the state acts on the present one of the simulation."""
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Act on an ``observation``, see stable-baselines3's ``predict``: without noise if ``deterministic``.
+
+        A policy of the state acts on the present one of the simulation. ``state`` is returned as it is, and
+        ``episode_start`` has no effect, as the policies have no memory.
+        """
         policy = self.trained_policy
         acting = policy.attached(self.simulation) if isinstance(policy, StatePolicy) else policy
-        return acting.predict(observation, *args, **kwargs)
+        return acting.predict(observation, state, episode_start, deterministic)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor_adam", "critic.adam"], []

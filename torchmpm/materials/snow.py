@@ -143,7 +143,10 @@ class Snow(Elastic):
         return xx, xy, yy
 
     def unresolved(self, C: Mat2, dt: float) -> Tensor | None:
-        """Which grains with the affine matrices C, (B, N) each, 1/s, pass no derivative on; ``None`` for none."""
+        """Which grains pass no derivative on, (B, N) bool; ``None`` for none.
+
+        Those that deform too much in a substep of ``dt`` s; C are the affine matrices, (B, N) each, 1/s.
+        """
         if self.exact_gradients:
             return None
         c0, c1, c2, c3 = C
