@@ -98,6 +98,7 @@ def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     ]
 
 
+@pytest.mark.slow
 def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path):
     assert main(["zero", "--tasks", "obstacle", "--out", str(tmp_path)]) == 0
     returns = read_results(tmp_path / "obstacle-zero.json")["returns"]

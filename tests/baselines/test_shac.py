@@ -52,6 +52,7 @@ def test_bad_options_are_named(changes, named):
         options(**changes).check()
 
 
+@pytest.mark.slow
 def test_training_makes_the_robot_run():
     learner = make(
         substeps=100, window=16, steps=480, max_episode_steps=32, learning_rate=1e-2, noise=0.0, train_particles=500

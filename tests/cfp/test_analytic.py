@@ -106,6 +106,7 @@ def parameters(module):
     return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 
 
+@pytest.mark.slow
 def test_training_shapes_the_robot(tmp_path):
     config = make("shapematch", resolutions=(8,), window=16, steps=448, max_episode_steps=48, num_layouts=2)
     config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=16, windows_kept=4, substeps=None)
