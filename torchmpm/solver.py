@@ -227,7 +227,7 @@ class Solver:
         return ParticleState.from_stack(torch.stack(end))
 
     def substep(self, scene: Scene, state: Components) -> Components:
-        """One substep of a scene, from a state of 13 components (B, N) to a new one; a subclass may compute it otherwise."""
+        """One substep of a scene, from the components (B, N) of a ``state`` to new ones; a subclass may do it otherwise."""
         return substep(scene, state)
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
