@@ -227,7 +227,10 @@ class Solver:
         return ParticleState.from_stack(torch.stack(end))
 
     def substep(self, scene: Scene, state: Components) -> Components:
-        """One substep of a scene, from the components (B, N) of a ``state`` to new ones; a subclass may do it otherwise."""
+        """One substep of a scene, from the components (B, N) of a ``state`` to new ones.
+
+        A subclass may compute it in another way.
+        """
         return substep(scene, state)
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
@@ -277,7 +280,7 @@ class Solver:
         return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
-        """What the substeps of a step share; the arguments are those of :meth:`step`, checked."""
+        """What the substeps of a step share; ``state``, ``actuation`` and ``origin`` are those of :meth:`step`, checked."""
         nodes = self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
@@ -318,7 +321,7 @@ class Solver:
             vars(self)["_tried"] = True
 
     def check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
-        """Check the arguments of a step; returns the origin (B, 2), m."""
+        """Check ``state``, ``actuation`` and ``origin`` of a :meth:`step`; returns the origin (B, 2), m."""
         self.check_state(state)
         batch, nodes = state.batch_size, self.grid.resolution
         field_shape = (batch, 2, nodes, nodes)
