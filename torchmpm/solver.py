@@ -280,7 +280,7 @@ class Solver:
         return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
-        """What the substeps of a step share; ``state``, ``actuation``, ``origin`` are those of :meth:`step`, checked."""
+        """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked."""
         nodes = self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
