@@ -122,7 +122,7 @@ class Learner(ABC):
 
     @abstractmethod
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy and its ``description`` as a ``.safetensors`` file, see `cfp.files.write_policy`."""
+        """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

@@ -156,7 +156,7 @@ class CFP(SAC):
     part only, as in the reference implementation. ``predict`` acts by the actor in training; see ``trained_actor``.
 
     Args:
-        policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
+        policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.NetworkPolicy``.
         env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
         hyperparameters: Hyperparameters of the stage.
         sac_options: Further options of stable-baselines3's SAC; those in ``hyperparameters`` are not among them.
