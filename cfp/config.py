@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
@@ -541,6 +542,18 @@ def check_task(task: object) -> None:
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
+
+
+def to_words(options: Mapping[str, Any]) -> list[str]:
+    """Options by name as the arguments of a command line."""
+    words = []
+    for name, value in options.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            words += [f"--{option}", *map(str, value if isinstance(value, list | tuple) else [value])]
+    return words
 
 
 def update_from_dict(base: Options, values: Any) -> Options:

@@ -13,7 +13,7 @@ from typing import Any
 from baselines import train
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.registry import ALGORITHMS
-from cfp.config import EVALUATION_SEED
+from cfp.config import EVALUATION_SEED, to_words
 from cfp.errors import ConfigError
 from cfp.files import read_json, write_json
 
@@ -98,18 +98,6 @@ class Run:
                     f"{name} must be {there.get(name)!r} as in the run in {self.folder}, got {mine.get(name)!r}; "
                     "or name another --out"
                 )
-
-
-def to_words(options: Options) -> list[str]:
-    """Options as the arguments of a command line."""
-    words = []
-    for name, value in options.items():
-        option = name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{option}" if value else f"--no-{option}")
-        else:
-            words += [f"--{option}", *map(str, value if isinstance(value, list | tuple) else [value])]
-    return words
 
 
 def resolved(options: Options) -> dict[str, Any]:

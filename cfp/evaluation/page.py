@@ -18,7 +18,7 @@ from torch import Tensor
 
 import torchmpm
 from cfp.agent.actor import Actor
-from cfp.config import RunConfig, differences, to_json
+from cfp.config import RunConfig, differences, to_json, to_words
 from cfp.evaluation.returns import Result, to_rows
 from cfp.files import write_atomically, write_text
 from cfp.tables import Table, columns, read_table
@@ -215,14 +215,7 @@ def command_words(config: RunConfig, preset: RunConfig) -> list[str]:
     """The words of the command that trains with these options."""
     given: dict[str, Any] = {"task": config.task, "algo": config.algo, "preset": config.preset, "seed": config.seed}
     given |= {name: value for name, (value, _) in changed_options(config, preset).items()}
-    words = ["torchmpm", "train"]
-    for name, value in given.items():
-        option = name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{option}" if value else f"--no-{option}")
-        else:
-            words += [f"--{option}", *map(str, value if isinstance(value, tuple | list) else [value])]
-    return words
+    return ["torchmpm", "train", *to_words(given)]
 
 
 def _command(config: RunConfig, preset: RunConfig) -> str:
