@@ -120,7 +120,6 @@ def test_other_options_are_refused_and_named(finished, capsys):
     assert compare(finished, *ALGOS, "--dry-run", plan=without_influence) == 0
 
 
-@pytest.mark.slow
 def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, tmp_path):
     out = tmp_path / "out"
     for number in (0, 1):

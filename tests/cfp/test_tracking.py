@@ -98,7 +98,6 @@ def test_pictures_show_the_mean_action_and_draw_no_random_number():
     assert pictures["picture/observation"][0, 0].tolist() == observation[0, :, 0, 0].tolist()
 
 
-@pytest.mark.slow
 def test_films_at_intervals_and_weights_and_biases_leave_learning_as_it_was(finished, wandb, tmp_path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
