@@ -248,9 +248,9 @@ def like_start(base: Config, values: dict[str, Any]) -> Config:
         return base
     if {option.name for option in dataclasses.fields(base)} <= values.keys():  # those of a run, whose start may be gone
         return base
-    spec, lean = load(values["start_from"]).spec, base.encoder == "small"
+    spec, small = load(values["start_from"]).spec, base.encoder == "small"
     base = replace(base, encoder=spec.encoder)
-    if isinstance(base, SACConfig) and lean and spec.encoder != "small":
+    if isinstance(base, SACConfig) and small and spec.encoder != "small":
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average")}
         base = replace(base, gradient_steps=4, batch_size=64, noise_cells=0, max_episode_steps=None, **usual)
         if len(base.resolutions) > 1:

@@ -33,8 +33,7 @@ def trained_layout(policy: Any) -> ActionLayout | None:
     trained_in = description.get("environment") if isinstance(description, Mapping) else None
     if trained_in is None:
         return None
-    # Policies of earlier versions may say "parity": "reference" instead, which had the layout of the reference.
-    return trained_in.get("action_layout") or ("grid" if trained_in.get("parity") == "reference" else "image")
+    return trained_in.get("action_layout") or "image"
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
