@@ -1,9 +1,6 @@
 """The kernels of a solver: whether they can run, a step through them, and the operators of torch that it calls."""
 
 import functools
-import importlib.util
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +13,7 @@ from torchmpm.boundary import VelocityRule, node_shift
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
 from torchmpm.native.cpu import call
+from torchmpm.native.cuda import launcher, unavailable
 from torchmpm.native.tables import (
     KINDS,
     Cotangents,
@@ -34,8 +32,8 @@ from torchmpm.state import ParticleState
 MAX_RULES = 255
 #: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
-#: The tape on CUDA takes no more than this, bytes.
-CUDA_TAPE_BYTES = 2**31
+#: Share of a GPU's memory that the tape of one simulation may take; as many simulations at once as fit have one.
+CUDA_TAPE_SHARE = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +52,11 @@ class Kernels:
         if device.type not in ("cpu", "cuda"):
             return f"its kernels run on the CPU and on CUDA, the state is on {device}"
         if device.type == "cuda":
-            missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
+            missing = unavailable(device)
             if missing is not None:
                 return missing
-            if torch.get_deterministic_debug_mode() == 2:  # not allowed, rather than warned of
-                return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
+            if torch.get_deterministic_debug_mode() == 2 and torch.is_grad_enabled():  # not allowed, or warned of
+                return "gradients on CUDA add in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
         return self._unsupported
 
     @functools.cached_property
@@ -123,23 +121,14 @@ class Kernels:
 
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
+        rows, batch, particles = components.shape
+        substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
         if components.is_cuda:
-            limit = CUDA_TAPE_BYTES // (components.element_size() * components.numel())
+            memory = torch.cuda.get_device_properties(components.device).total_memory
+            limit = int(CUDA_TAPE_SHARE * memory) // substep
         else:
-            rows, batch, particles = components.shape
-            substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
             limit = call.KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
-
-
-@functools.cache
-def triton_missing(compiler: str | None, path: str | None) -> str | None:
-    """Why Triton cannot work, or ``None`` if it can, with $CC and $PATH as given."""
-    if importlib.util.find_spec("triton") is None:
-        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
-    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
-        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
-    return None
 
 
 _INPUTS = "Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
@@ -177,18 +166,8 @@ def native_step_backward(*arguments: Any) -> Cotangents:
     return cotangents
 
 
-@native_step.register_kernel("cuda")
-def _(*arguments: Any) -> Tensor:
-    from torchmpm.native import cuda  # not at the top: it imports Triton
-
-    return cuda.forward(*arguments)
-
-
-@native_step_backward.register_kernel("cuda")
-def _(*arguments: Any) -> Cotangents:
-    from torchmpm.native import cuda
-
-    return cuda.backward(*arguments)
+native_step.register_kernel("cuda")(launcher.forward)
+native_step_backward.register_kernel("cuda")(launcher.backward)
 
 
 @native_step.register_fake
