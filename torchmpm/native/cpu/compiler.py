@@ -11,8 +11,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-#: Headers that all kernels may include.
+#: Headers that all kernels may include, and those for CPU and GPU that these include.
 HEADERS = Path(__file__).resolve().parent
+COMMON = HEADERS.parent / "common"
 #: Not -ffast-math: it lets compilers assume that there is no NaN.
 _FLAGS = (
     *("-std=c++17", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
@@ -58,6 +59,6 @@ def compiled_path(source: Path, options: Sequence[str], processor: str) -> Path:
 def digest_of(source: Path, *facts: str) -> str:
     """Hash of the sources beside a file, the headers and some facts."""
     digest = hashlib.sha256("\n".join(facts).encode())
-    for file in sorted(file for place in {source.resolve().parent, HEADERS} for file in place.glob("*.[ch]pp")):
+    for file in sorted(file for place in {source.resolve().parent, HEADERS, COMMON} for file in place.glob("*.[ch]pp")):
         digest.update(file.read_bytes())
     return digest.hexdigest()
