@@ -16,8 +16,8 @@ from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value, try_law
 from torchmpm.materials.body import Body, per_particle, slices
-from torchmpm.native.cpu.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.kernels import Kernels
+from torchmpm.native.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.tables import KINDS
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -244,7 +244,7 @@ class Solver:
         """
         if self.backend == "eager":
             return False
-        reason = self._not_native(state.device, self._has_tangents(state, *fields))
+        reason = self._not_native(state, *fields)
         if self.backend == "native":
             if reason is not None:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -271,13 +271,15 @@ class Solver:
         tensors = tree.leaves((state, fields, self.constants))
         return not transforming() and any(unpack_dual(tensor).tangent is not None for tensor in tensors)
 
-    def _not_native(self, device: torch.device, tangents: bool) -> str | None:
-        """Why the kernels cannot run a step on a device, or ``None`` if they can."""
+    def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
+        """Why the kernels cannot run a step, or ``None`` if they can."""
         if type(self).substep is not Solver.substep:
             return f"it does not call {type(self).__name__}.substep"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
+        if self._has_tangents(state, *fields):
+            return "it has no forward-mode derivatives"
+        return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
         """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked."""

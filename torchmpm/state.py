@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks, tree
-from torchmpm.native.cpu.library import leave_parent_threads
+from torchmpm.native.library import leave_parent_threads
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
