@@ -15,11 +15,11 @@ from torch import Tensor
 
 from torchmpm import tree
 from torchmpm.boundary import VelocityRule
+from torchmpm.checks import Segment
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
 from torchmpm.native.library import POOL, load, thread_pool
 from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
-from torchmpm.rollout import Segment
 from torchmpm.state import ParticleState
 
 #: A node remembers its rule for each direction in one byte, in which 0 stands for none.
