@@ -1,7 +1,7 @@
-"""The kernels in CUDA C++, for tensors on a GPU; ``launcher`` has the operators of :mod:`torchmpm.native.kernels` there.
+"""The kernels in CUDA C++, for tensors on a GPU; ``launcher`` is what :mod:`torchmpm.native.kernels` calls there.
 
-``forward.cu`` and ``adjoint.cu`` hold the kernels, whose formulas are those of ``native/common``, which the CPU compiles
-too. ``arguments`` is what they take, ``compiler`` compiles them with NVRTC, ``plan`` decides which are launched on how
+``forward.cu`` and ``adjoint.cu`` hold the kernels, with the formulas of ``native/common``, which the CPU compiles too.
+``arguments`` is what they take, ``compiler`` compiles them with NVRTC, ``plan`` decides which are launched on how
 many blocks, and ``launcher`` does it through ``driver``.
 
 A block of threads takes one simulation through all substeps of a step in one launch: particles stay in registers, and

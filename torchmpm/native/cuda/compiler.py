@@ -14,8 +14,8 @@ from pathlib import Path
 
 import torch
 
-from torchmpm.native.cpu.library import cache_folder
 from torchmpm.native.cuda.arguments import Kernel
+from torchmpm.native.library import cache_folder
 
 #: The kernels, and the headers that they share with those of the CPU.
 FOLDERS = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "common")
@@ -89,7 +89,9 @@ def _key(kernel: Kernel, arch: str) -> str:
 def _sources() -> bytes:
     """Hash of all sources."""
     digest = hashlib.sha256()
-    for file in sorted(file for folder in FOLDERS for file in folder.iterdir() if file.suffix in (".cu", ".cuh", ".hpp")):
+    for file in sorted(
+        file for folder in FOLDERS for file in folder.iterdir() if file.suffix in (".cu", ".cuh", ".hpp")
+    ):
         digest.update(file.name.encode() + file.read_bytes())
     return digest.digest()
 

@@ -1,4 +1,4 @@
-"""Runs the CUDA kernels on tensors: the operators of :mod:`torchmpm.native.kernels` there."""
+"""Runs the CUDA kernels on tensors: what :mod:`torchmpm.native.kernels` calls there."""
 
 import ctypes
 import functools
@@ -7,14 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchmpm import tree
-from torchmpm.native.cuda.arguments import COUNTERS, Arguments
+from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel, kinds_of
 from torchmpm.native.cuda.driver import Cuda, Driver, Launch
 from torchmpm.native.cuda.plan import Call, Pass, passes
-from torchmpm.native.tables import BodyTable, Cotangents, Inputs, RuleTable, tables_of
+from torchmpm.native.tables import BodyTable, Inputs, RuleTable, Tables
 
 REAL = {torch.float32: "float", torch.float64: "double"}
-#: Derivatives that the adjoint writes, in the order of :class:`Cotangents`.
+#: Derivatives that the adjoint writes, in the order of :meth:`Inputs.empty_cotangents`.
 COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
@@ -28,32 +27,38 @@ class Launcher:
         self.driver = driver
         self._plan = functools.lru_cache(maxsize=256)(self._make_plan)
 
-    def forward(self, *arguments: Any) -> Tensor:
-        """Advance all simulations; see :func:`torchmpm.native.kernels.native_step`."""
-        *tensors, handle, substeps = arguments
-        inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+    def forward(self, inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
+        """Components (13, B, N) after some substeps."""
         result = torch.empty_like(inputs.components)
-        self._run(inputs, handle, substeps, result=result)
+        self._run(inputs, tables, substeps, result=result)
         return result
 
-    def backward(self, *arguments: Any) -> Cotangents:
-        """Adjoint of :meth:`forward`; see :func:`torchmpm.native.kernels.native_step_backward`."""
-        *tensors, handle, substeps, wants_field, wants_values = arguments
-        inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
-        cotangents = inputs.empty_cotangents(wants_field, wants_values)
-        self._run(inputs, handle, substeps, **dict(zip(COTANGENTS, cotangents, strict=True)))
-        return cotangents
+    def backward(
+        self, inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool
+    ) -> tuple[Tensor, ...]:
+        """Replay the substeps, then go back; derivatives as :meth:`Inputs.empty_cotangents` lists them."""
+        bars = inputs.empty_cotangents(wants_field, wants_values)
+        self._run(inputs, tables, substeps, **dict(zip(COTANGENTS, bars, strict=True)))
+        return bars
 
-    def _run(self, inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
+    def _run(self, inputs: Inputs, tables: Tables, substeps: int, **outputs: Tensor) -> None:
         _, batch, particles = inputs.components.shape
-        device, tables = inputs.components.device, tables_of(handle)
-        muscles = inputs.field is not None and any(body.muscle for body in tables.bodies[: tables.num_bodies])
-        real = REAL[inputs.components.dtype]
-        call = Call(inputs.result_bar is not None, real, batch, particles, substeps, muscles)
-        plan = self._plan(call, handle, device)
-        bodies, rules = _device_tables(handle, device)
+        device, bodies = inputs.components.device, tables.bodies[: tables.num_bodies]
+        call = Call(
+            adjoint=inputs.result_bar is not None,
+            real=REAL[inputs.components.dtype],
+            batch=batch,
+            particles=particles,
+            substeps=substeps,
+            resolution=tables.resolution,
+            bodies=tables.num_bodies,
+            kinds=kinds_of(bodies),
+            muscles=inputs.field is not None and any(body.muscle for body in bodies),
+        )
+        plan = self._plan(call, device)
+        body_table, rule_table = (_upload(content, device) for content in _contents(tables))
         status = torch.empty(batch, dtype=torch.int32, device=device) if len(plan) > 1 else None
-        tensors = inputs._asdict() | outputs | {"bodies": bodies, "rules": rules, "status": status}
+        tensors = inputs._asdict() | outputs | {"bodies": body_table, "rules": rule_table, "status": status}
         sizes = ("resolution", "num_bodies", "num_rules", "h", "dt", "margin", "extent", "damping")
         common: dict[str, Any] = {
             "batch": batch,
@@ -78,19 +83,13 @@ class Launcher:
             )
             launch = Launch(teams * one.team, one.kernel.threads, one.shared_bytes, not one.kernel.shared)
             self.driver.launch(function, launch, arguments, device)
+            del scratch, counters  # the next launch on this stream may have their memory
 
-    def _make_plan(self, call: Call, handle: int, device: torch.device) -> list[tuple[Pass, Any]]:
-        load = functools.partial(self.driver.load, device=device)
-        resident = self.driver.resident
-        return [
-            (one, load(one.kernel))
-            for one in passes(
-                call,
-                tables_of(handle),
-                self.driver.card(device),
-                lambda kernel, size: resident(load(kernel), kernel.threads, size, device),
-            )
-        ]
+    def _make_plan(self, call: Call, device: torch.device) -> list[tuple[Pass, Any]]:
+        def resident(kernel: Kernel, shared_bytes: int) -> int:
+            return self.driver.resident(self.driver.load(kernel, device), kernel.threads, shared_bytes, device)
+
+        return [(one, self.driver.load(one.kernel, device)) for one in passes(call, self.driver.card(device), resident)]
 
 
 def _scratch(one: Pass, device: torch.device) -> tuple[Tensor, int]:
@@ -106,22 +105,20 @@ def _scratch(one: Pass, device: torch.device) -> tuple[Tensor, int]:
             teams = (teams + 1) // 2
 
 
-@functools.lru_cache(maxsize=256)
-def _device_tables(handle: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The bodies and the rules of a handle on a device; kept, so that a step copies nothing there."""
-    tables = tables_of(handle)
-    contents = (
+def _contents(tables: Tables) -> tuple[bytes, bytes]:
+    """The tables of the bodies and of the rules."""
+    return (
         ctypes.string_at(tables.bodies, tables.num_bodies * ctypes.sizeof(BodyTable)),
         ctypes.string_at(tables.rules, tables.num_rules * ctypes.sizeof(RuleTable)),
     )
-    with torch.inference_mode(False):
-        bodies, rules = (_upload(content, device) for content in contents)
-    return bodies, rules
 
 
+@functools.lru_cache(maxsize=256)
 def _upload(content: bytes, device: torch.device) -> Tensor:
-    host = torch.tensor(list(content), dtype=torch.uint8, device="cpu")
-    return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
+    """Bytes on a device; kept, so that a step copies nothing there."""
+    with torch.inference_mode(False):
+        host = torch.tensor(list(content), dtype=torch.uint8, device="cpu")
+        return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
 
 
 #: Launches on CUDA.
