@@ -1,15 +1,17 @@
 """What the library does on a GPU, in at most eight minutes: does it run, is it right, how fast is it, does it train?
 
 `make gpu` runs it. The stages are processes of their own with a time limit each. Results are written after every check,
-a failure is recorded and passed over, and a short table comes last. On a GPU they go to `benchmarks/gpu/CARD-DATE.json`,
-from which `docs/tables.py` makes the tables of the documentation. Without a GPU the same stages run with tiny sizes on
-the imitation of the kernels that the tests use, and the results go to a temporary folder.
+a failure is recorded and passed over, and a short table comes last. On a GPU they go to
+`benchmarks/gpu/CARD-DATE.json`, from which `docs/tables.py` makes the tables of the documentation. Without a GPU the
+same stages run with tiny sizes on the imitation of the kernels that the tests use, and the results go to a temporary
+folder.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
 import io
 import json
 import math
@@ -26,6 +28,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, replace
 from datetime import date
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -192,44 +195,50 @@ def launches(lab: Lab) -> Figures:
 
 #: Each thread adds to places that spread over a window of nodes, as particles do.
 ADDITIONS = r"""
-#define PLACE(i) ((unsigned(i) * 2654435761u >> 8) % 2304u)
-extern "C" __global__ void global_one(float* at, int rounds) {
-    for (int k = 0; k < rounds; ++k) atomicAdd(at + blockIdx.x * 9216 + PLACE(threadIdx.x + 37 * k), 1.0f);
+struct Arguments { float* at; int rounds; };
+
+template <class T, class Add> __device__ void repeat(T* nodes, int rounds, Add one) {
+    for (int k = 0; k < rounds; ++k) atomicAdd(nodes + ((threadIdx.x + 37 * k) * 2654435761u >> 8) % 2304, one);
 }
-extern "C" __global__ void global_four(float4* at, int rounds) {
-#if __CUDA_ARCH__ >= 900
-    for (int k = 0; k < rounds; ++k) atomicAdd(at + blockIdx.x * 2304 + PLACE(threadIdx.x + 37 * k), float4{1, 1, 1, 1});
-#endif
-}
-template <class T> __device__ void shared(float* at, int rounds) {
+
+template <class T> __device__ void in_shared_memory(const Arguments& a) {
     __shared__ T nodes[2304];
     for (int i = threadIdx.x; i < 2304; i += blockDim.x) nodes[i] = 0;
     __syncthreads();
-    for (int k = 0; k < rounds; ++k) atomicAdd(nodes + PLACE(threadIdx.x + 37 * k), T(1));
+    repeat(nodes, a.rounds, T(1));
     __syncthreads();
-    if (threadIdx.x < 4) at[threadIdx.x] += float(nodes[threadIdx.x]);
+    if (threadIdx.x < 4) a.at[threadIdx.x] += float(nodes[threadIdx.x]);
 }
-extern "C" __global__ void shared_float(float* at, int rounds) { shared<float>(at, rounds); }
-extern "C" __global__ void shared_int(float* at, int rounds) { shared<int>(at, rounds); }
+
+extern "C" __global__ void global_one(Arguments a) { repeat(a.at + blockIdx.x * 9216, a.rounds, 1.0f); }
+extern "C" __global__ void global_four(Arguments a) {
+#if __CUDA_ARCH__ >= 900
+    repeat((float4*)a.at + blockIdx.x * 2304, a.rounds, float4{1.0f, 1.0f, 1.0f, 1.0f});
+#endif
+}
+extern "C" __global__ void shared_float(Arguments a) { in_shared_memory<float>(a); }
+extern "C" __global__ void shared_int(Arguments a) { in_shared_memory<int>(a); }
 """
 
 
 def additions(lab: Lab) -> Figures:
     """Atomic additions in global memory, of one and of four numbers, and in shared memory, 10^9 a second."""
-    from torchmpm.native.cuda import driver
+    from torchmpm.native.cuda.compiler import compile_source
+    from torchmpm.native.cuda.driver import Cuda, Launch
 
+    class Arguments(ctypes.Structure):
+        _fields_ = [("at", ctypes.c_void_p), ("rounds", ctypes.c_int)]
+
+    driver, device = Cuda(), torch.device("cuda", torch.cuda.current_device())
     major, minor = torch.cuda.get_device_capability()
-    names = ("global_one", "global_four", "shared_float", "shared_int")
-    binary = driver.compile_source(ADDITIONS, f"sm_{major}{minor}", ())
-    module = driver.Cuda().load(binary, names)
-    blocks, threads, rounds = torch.cuda.get_device_properties(0).multi_processor_count, 512, 1000
+    binary, blocks, threads, rounds = compile_source(ADDITIONS, f"sm_{major}{minor}", {}), 132, 512, 1000
     room, found = torch.zeros(blocks * 9216, device=lab.device), {}
-    for name in names if major >= 9 else (names[0], *names[2:]):
-        launch = driver.Launch(module[name], (blocks, 1, 1), (threads, 1, 1))
-        arguments = driver.pack((room.data_ptr(), rounds), "Pi")
-        stream = torch.cuda.current_stream().cuda_stream
-        call = lambda launch=launch, arguments=arguments: driver.Cuda().launch(launch, stream, arguments)  # noqa: E731
-        found[f"{name} (G/s)"] = lab.rate(call, blocks * threads * rounds / 1e9, 0.3)
+    arguments = Arguments(room.data_ptr(), rounds)
+    for name in ("global_one", "global_four", "shared_float", "shared_int"):
+        if name != "global_four" or major >= 9:
+            launch = partial(driver.launch, driver.function(binary, name, device), Launch(blocks, threads))
+            rate = lab.rate(partial(launch, arguments, device), blocks * threads * rounds / 1e9, 0.3)
+            found[f"{name} (G/s)"] = rate
     return found
 
 

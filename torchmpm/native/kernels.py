@@ -15,7 +15,8 @@ from torchmpm.boundary import VelocityRule
 from torchmpm.checks import Segment
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
-from torchmpm.native.cuda import launcher, unavailable
+from torchmpm.native.cuda.compiler import unavailable
+from torchmpm.native.cuda.launcher import CUDA
 from torchmpm.native.library import POOL, load, thread_pool
 from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
 from torchmpm.state import ParticleState
@@ -163,7 +164,7 @@ class Adjoint(torch.autograd.Function):
 def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
     """Components (13, B, N) after some substeps."""
     if inputs.components.is_cuda:
-        return launcher.forward(inputs, tables, substeps)
+        return CUDA.forward(inputs, tables, substeps)
     result = torch.empty_like(inputs.components)
     call("torchmpm_forward", inputs, tables, substeps, result=result)
     return result
@@ -174,7 +175,7 @@ def backward(
 ) -> tuple[Tensor, ...]:
     """Replay the substeps, then go back; derivatives as :meth:`Inputs.empty_cotangents` lists them."""
     if inputs.components.is_cuda:
-        return launcher.backward(inputs, tables, substeps, wants_field, wants_values)
+        return CUDA.backward(inputs, tables, substeps, wants_field, wants_values)
     bars = inputs.empty_cotangents(wants_field, wants_values)
     wanted = {name: bar for name, bar in zip(COTANGENTS, bars, strict=True) if bar.numel()}
     call("torchmpm_backward", inputs, tables, substeps, **wanted)

@@ -9,22 +9,3 @@ the nodes around them in shared memory. Simulations that do not fit there are ta
 nodes in global memory. Masses and momenta are added as integers, so that their order makes no difference: forward
 results are the same in every run, and do not depend on what else is in the batch.
 """
-
-import torch
-
-from torchmpm.native.cuda.compiler import missing
-from torchmpm.native.cuda.launcher import launcher
-
-__all__ = ["launcher", "unavailable"]
-
-#: The oldest cards that the kernels are compiled for.
-OLDEST = (8, 0)
-
-
-def unavailable(device: torch.device) -> str | None:
-    """Why the kernels cannot run on a CUDA device, or ``None``."""
-    reason = missing(torch.version.cuda)
-    if reason is None and (capability := torch.cuda.get_device_capability(device)) < OLDEST:
-        found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
-        reason = f"on CUDA it needs a card of compute capability {least} or newer, {device} has {found}"
-    return reason

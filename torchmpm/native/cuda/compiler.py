@@ -22,8 +22,19 @@ FOLDERS = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] 
 #: Roots and divisions are rounded as on the CPU, and small numbers are kept: a strain whose square were flushed to zero
 #: would have a derivative that is divided by zero.
 _ROUNDING = {"ftz": False, "prec_sqrt": True, "prec_div": True, "fma": True}
+#: The oldest cards that the kernels are compiled for, by their compute capability.
+OLDEST = (8, 0)
 _logger = logging.getLogger(__name__)
 _lock = threading.Lock()
+
+
+def unavailable(device: torch.device) -> str | None:
+    """Why the kernels cannot run on a CUDA device, or ``None``."""
+    reason = missing(torch.version.cuda)
+    if reason is None and (capability := torch.cuda.get_device_capability(device)) < OLDEST:
+        found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
+        reason = f"on CUDA it needs a card of compute capability {least} or newer, {device} has {found}"
+    return reason
 
 
 def missing(cuda: str | None) -> str | None:
@@ -68,7 +79,7 @@ def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.Stri
         arch=arch,
         std="c++17",
         include_path=list(map(str, FOLDERS)),
-        define_macro=list(macros.items()),
+        define_macro=list(macros.items()) or None,
         ptxas_options="-v" if log else None,
         **_ROUNDING,
     )

@@ -2,6 +2,8 @@
 
 import ctypes
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -73,7 +75,7 @@ class Cuda:
 
     def resident(self, function: Any, threads: int, shared_bytes: int, device: torch.device) -> int:
         """See :class:`Driver`."""
-        with torch.cuda.device(device):
+        with _context(device):
             measure = _bindings().cuOccupancyMaxActiveBlocksPerMultiprocessor
             return _checked(measure(function, threads, shared_bytes)) * self.card(device).multiprocessors
 
@@ -82,7 +84,7 @@ class Cuda:
         pointers = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         grid, block = (launch.blocks, 1, 1), (launch.threads, 1, 1)
         cuda, address = _bindings(), ctypes.addressof(pointers)
-        with torch.cuda.device(device):
+        with _context(device):
             stream = torch.cuda.current_stream(device).cuda_stream
             if launch.cooperative:
                 start = cuda.cuLaunchCooperativeKernel
@@ -96,6 +98,16 @@ def _bindings() -> Any:
     from cuda.bindings import driver
 
     return driver
+
+
+@contextmanager
+def _context(device: torch.device) -> Iterator[None]:
+    """Meanwhile, torch's context of a device is the thread's own; a thread that has just begun may have none."""
+    cuda = _bindings()
+    with torch.cuda.device(device):
+        if not int(_checked(cuda.cuCtxGetCurrent())):
+            _checked(cuda.cuCtxSetCurrent(_checked(cuda.cuDevicePrimaryCtxRetain(device.index))))
+        yield
 
 
 def _checked(result: tuple[Any, ...]) -> Any:

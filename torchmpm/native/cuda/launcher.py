@@ -121,5 +121,5 @@ def _upload(content: bytes, device: torch.device) -> Tensor:
         return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
 
 
-#: Launches on CUDA.
-launcher = Launcher(Cuda())
+#: Launches on GPUs.
+CUDA = Launcher(Cuda())
