@@ -25,7 +25,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext, redirect_stdout
+from contextlib import ExitStack, nullcontext, redirect_stdout
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
@@ -524,8 +524,8 @@ def training(lab: Lab) -> Iterator[Check]:
 
 
 def train_options(lab: Lab, learner: str, steps: int) -> list[str]:
-    """A training of RUN in one stage."""
-    words = f"--task run --learner {learner} --steps {steps} --resolutions 4 --handover --no-video --eval-every 0"
+    """A training in one stage; of SHAPE MATCH on the imitation, where its episodes are short."""
+    words = f"--task {'shapematch' if lab.tiny else 'run'} --learner {learner} --steps {steps} --resolutions 4 --handover --no-video --eval-every 0"
     words += f" --eval-episodes 1 --device {lab.device}"
     if not lab.tiny:
         return words.split() + (["--num-envs", "1024"] if learner == "sac" else ["--num-envs", "64"])
@@ -765,10 +765,14 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=480.0, help="for everything (default 480)")
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES), help="default: all")
     parser.add_argument("--out", type=Path, help="file of the results")
+    parser.add_argument("--extra", action="store_true", help="print the extra of torchmpm that fits torch, and end")
     parser.add_argument("--stage", help=argparse.SUPPRESS)
     parser.add_argument("--first", type=int, default=0, help=argparse.SUPPRESS)
     parser.add_argument("--scratch", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.extra:
+        print(f"cuda{str(torch.version.cuda).partition('.')[0]}")
+        return 0
     args.device = args.device or "imitation"
     sys.path[0] = str(ROOT)  # not this folder, in which `gpu` is this file
     if args.stage:
@@ -789,10 +793,14 @@ def main() -> int:
 
 def imitation() -> Any:
     """Meanwhile, tensors on the CPU go to the CUDA kernels as the tests run them there."""
-    sys.path.append(str(ROOT / "tests/torchmpm"))
-    from cuda_imitation import imitated
+    sys.path += [str(ROOT / "tests"), str(ROOT / "tests/torchmpm")]
+    from cuda_drivers import Imitation, in_use
+    from short_episodes import short_episodes
 
-    return imitated()
+    stack = ExitStack()
+    stack.enter_context(in_use(Imitation()))
+    stack.enter_context(short_episodes())
+    return stack
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from torchmpm.native.cuda import compiler, launcher, plan
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.tables import BodyTable, RuleTable
+from torchmpm.solver import kernels_fail
 
 #: What a block has without asking.
 USUAL_SHARED_BYTES = 48 * 1024
@@ -266,3 +267,26 @@ def test_an_old_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
     reason = compiler.unavailable(torch.device("cuda", 0))
     assert reason == "on CUDA it needs a card of compute capability 8.0 or newer, cuda:0 has 7.5"
+
+
+def test_kernels_that_differ_or_fail_are_not_chosen() -> None:
+    """The check of a device says which number differed, or what went wrong; here nothing is computed at all."""
+    device = torch.device("cpu")
+    kernels_fail.cache_clear()
+    assert kernels_fail(device) is None  # the kernels of the CPU
+    kernels_fail.cache_clear()
+    with in_use(Zeros()):
+        reason = kernels_fail(device)
+    assert reason == "its kernels were tried on cpu, and x differed by 1.0e+00 from that of eager"
+    kernels_fail.cache_clear()
+    with in_use(Recorder(Card(1, 100))):
+        assert "and failed: the card cannot run a block" in str(kernels_fail(device))
+    kernels_fail.cache_clear()
+
+
+class Zeros(Recorder):
+    """Writes zeros as results."""
+
+    def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
+        if arguments.result:
+            ctypes.memset(arguments.result, 0, 4 * 13 * arguments.batch * arguments.particles)

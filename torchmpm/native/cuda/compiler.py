@@ -63,9 +63,14 @@ def compile_kernel(kernel: Kernel, arch: str) -> bytes:
         with suppress(OSError):
             return path.read_bytes()
         _logger.info("compiling %s for %s (once on this machine, some seconds)", kernel.name, arch)
-        binary = compile_source((FOLDERS[0] / kernel.source).read_text(), arch, kernel.macros)
+        binary = compile_source(source_of(kernel), arch, kernel.macros)
         _keep(path, binary)
     return binary
+
+
+def source_of(kernel: Kernel) -> str:
+    """The text of a kernel."""
+    return (FOLDERS[0] / kernel.source).read_text(encoding="utf-8")
 
 
 def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.StringIO | None = None) -> bytes:
@@ -86,7 +91,7 @@ def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.Stri
     try:
         return bytes(Program(text, "c++", options).compile("cubin", logs=log).code)
     except Exception as error:  # of cuda.core, whose own type has no public name, or NVRTC is not found
-        raise ValueError(f"its CUDA kernels cannot be compiled for {arch}: {str(error)[-4000:]}") from error
+        raise ValueError(f"its CUDA kernels cannot be compiled for {arch}: {str(error)[:4000]}") from error
 
 
 def _key(kernel: Kernel, arch: str) -> str:
