@@ -2,13 +2,11 @@
 #pragma once
 #include "scalar.hpp"
 
-struct Rule {
+// What a velocity rule does.
+struct Wall {
     int axis;
     Real sign;
-    double range[2][2];  // inclusive nodes in x and y
-    Real friction;       // infinite: sticks
-    bool world;
-    int slot;
+    Real friction;  // infinite: sticks
 };
 
 // A node remembers its rules in one byte per slot, 0 for none, else the index of the rule plus one.
@@ -23,27 +21,27 @@ INLINE Real node_velocity(Real momentum, Real inverse, Real gain, Real damping) 
     return (momentum * inverse + gain) * damping;
 }
 
-INLINE bool acts(const Rule& rule, Real normal) { return rule.sign > 0 ? normal > 0 : normal < 0; }
+INLINE bool acts(const Wall& wall, Real normal) { return wall.sign > 0 ? normal > 0 : normal < 0; }
 
-INLINE void constrain(const Rule& rule, Real& normal, Real& tangent) {
-    if (!acts(rule, normal)) return;
-    if (math::isinf(rule.friction))
+INLINE void constrain(const Wall& wall, Real& normal, Real& tangent) {
+    if (!acts(wall, normal)) return;
+    if (math::isinf(wall.friction))
         tangent = 0;
-    else if (rule.friction != 0)
-        tangent = math::copysign(at_least(math::fabs(tangent) - rule.friction * math::fabs(normal), 0), tangent);
+    else if (wall.friction != 0)
+        tangent = math::copysign(at_least(math::fabs(tangent) - wall.friction * math::fabs(normal), 0), tangent);
     normal = 0;
 }
 
 // Velocity of a node under one rule, without an address that depends on the axis.
-INLINE void constrain(const Rule& rule, Real (&v)[2]) {
-    if (rule.axis == 0)
-        constrain(rule, v[0], v[1]);
+INLINE void constrain(const Wall& wall, Real (&v)[2]) {
+    if (wall.axis == 0)
+        constrain(wall, v[0], v[1]);
     else
-        constrain(rule, v[1], v[0]);
+        constrain(wall, v[1], v[0]);
 }
 
 // And under all of its rules.
-template <class Rules> INLINE void constrain(const Rules& rules, uint32_t code, Real (&v)[2]) {
+template <class Walls> INLINE void constrain(const Walls& walls, uint32_t code, Real (&v)[2]) {
     for (; code; code >>= 8)
-        if (code & 255) constrain(rules[(code & 255) - 1], v);
+        if (code & 255) constrain(walls[(code & 255) - 1], v);
 }

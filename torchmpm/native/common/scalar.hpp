@@ -42,10 +42,12 @@ template <class> struct BitsOf;
 template <> struct BitsOf<float> {
     using type = uint32_t;
     static constexpr int mantissa = 23, bias = 127;
+    static constexpr float largest = 3.4028234e38f;
 };
 template <> struct BitsOf<double> {
     using type = uint64_t;
     static constexpr int mantissa = 52, bias = 1023;
+    static constexpr double largest = 1.7976931348623157e308;
 };
 using Bits = BitsOf<Real>;
 

@@ -47,6 +47,12 @@ struct Body {
     int first_block;
 };
 
+struct Rule : Wall {
+    double range[2][2];  // inclusive nodes in x and y
+    bool world;
+    int slot;
+};
+
 struct Scene {
     Call call;
     int resolution, width, blocks = 0, parts;
@@ -64,8 +70,10 @@ struct Scene {
         mass_epsilon = Real(t.mass_epsilon);
         for (const BodyTable* b = t.bodies; b != t.bodies + t.num_bodies; ++b) add(*b, Real(t.stretch_floor));
         for (const RuleTable* r = t.rules; r != t.rules + t.num_rules; ++r)
-            rules.push_back({int(r->axis), Real(r->sign), {{r->i_low, r->i_high}, {r->j_low, r->j_high}},
-                             Real(r->friction), r->world != 0, int(r->slot)});
+            rules.push_back({{int(r->axis), Real(r->sign), Real(r->friction)},
+                             {{r->i_low, r->i_high}, {r->j_low, r->j_high}},
+                             r->world != 0,
+                             int(r->slot)});
         // The groups of blocks that are summed separately depend only on the particles of one simulation, so results do
         // not depend on threads or on the other simulations of the batch.
         parts = blocks < 16 ? 1 : blocks < 128 ? 2 : blocks < 512 ? 4 : 8;
