@@ -22,7 +22,6 @@ import tyro
 import dittogym  # noqa: F401  registers the environments
 from cfp.config import Particles
 from cfp.tables import CSVTable
-from torchmpm import diagnostics
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def main(options: Options) -> None:
             _, rewards, terminated, truncated, info = env.step(action)
             episodes += 0 if options.endless else int((terminated | truncated).sum())
             failed += int(np.count_nonzero(info["reward_terms/failure"]))
-            broken += int(np.count_nonzero(~np.isfinite(rewards)) + (~diagnostics.finite(env.unwrapped.state)).sum())
+            broken += int(np.count_nonzero(~np.isfinite(rewards)) + (~env.unwrapped.state.is_finite()).sum())
         seconds = time.process_time() - start
         row = {
             "step": int(last) * options.robots,

@@ -13,6 +13,7 @@ import pkgutil
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import dittogym
 from baselines.compare import paper
@@ -216,6 +217,42 @@ def best_rewards() -> str:
     )
 
 
+def gpu_run() -> dict[str, Any]:
+    """The last results of `make gpu`: the card, the date, and the rows of the stage `speed` by their names."""
+    files = (ROOT / "benchmarks/gpu").glob("*.json")
+    found = max((json.loads(path.read_text()) for path in files), key=lambda result: result["date"], default=None)
+    if found is None:
+        return {"card": "no card has run `make gpu` yet", "speed": {}}
+    card = next(row["figures"]["card"] for row in found["rows"] if row["check"] == "versions")
+    speed = {row["check"]: row for row in found["rows"] if row["stage"] == "speed" and not row["wrong"]}
+    return {"card": f"{card}, {found['date']}", "speed": speed}
+
+
+def rate(row: dict[str, Any] | None, name: str) -> str:
+    """A speed of a row, or nothing."""
+    return number(str(row["figures"].get(f"{name} (steps/s)", ""))) if row else ""
+
+
+def gpu() -> str:
+    """Environment steps a second on the card that ran `make gpu` last."""
+    run, columns = gpu_run(), ("physics", "physics with gradient", "env.step", "env.step with gradient")
+    rows = [
+        [f"{name} ({row['backend']})", *(rate(row, column) for column in columns)]
+        for name, row in run["speed"].items()
+        if "physics (steps/s)" in row["figures"]
+    ]
+    return markdown(("Robots × particles", *columns), rows or [[run["card"], *[""] * len(columns)]])
+
+
+def gpu_line() -> str:
+    """The same in a line."""
+    run = gpu_run()
+    one, many = (run["speed"].get(name) for name in ("1 × full", "1024 × lite"))
+    cells = [rate(one, "env.step"), rate(many, "env.step"), rate(many, "env.step with gradient")]
+    columns = ("RUN, steps/s", "1 robot, 22,000 particles", "1,024 robots of 2,000", "1,024 with gradients")
+    return markdown(columns, [[run["card"], *cells]])
+
+
 def from_csv(name: str) -> str:
     """A CSV file as it is."""
     rows = read(name)
@@ -321,6 +358,8 @@ TABLES: dict[str, Callable[..., str]] = {
     "constants": constants,
     "csv": from_csv,
     "geometry": geometry,
+    "gpu": gpu,
+    "gpu-line": gpu_line,
     "leaderboard": leaderboard,
     "names": names,
     "planning": planning,

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchmpm import checks
-from torchmpm.native.cpu.library import leave_parent_threads
+from torchmpm.native.library import leave_parent_threads
 from torchmpm.tree import transforming
 
 Points = NDArray[np.float64]

@@ -1,6 +1,7 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from dataclasses import dataclass, fields
+import functools
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,13 +14,17 @@ from torch.nn.functional import pad
 from torchmpm import checks, stability, tree
 from torchmpm.backends import BACKENDS, warn_eager
 from torchmpm.boundary import VelocityRule, faces
+from torchmpm.checks import Segment
 from torchmpm.grid import PAD, Grid
-from torchmpm.materials.base import Value, try_law
+from torchmpm.materials.base import Value, lame, try_law
 from torchmpm.materials.body import Body, per_particle, slices
-from torchmpm.native.cpu.library import NO_COMPILER, leave_parent_threads, load, provenance
+from torchmpm.materials.von_mises import VonMises
+from torchmpm.native.cuda.compiler import unavailable
 from torchmpm.native.kernels import Kernels
+from torchmpm.native.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.tables import KINDS
-from torchmpm.rollout import Segment, check_repetition, repeated
+from torchmpm.rollout import repeated
+from torchmpm.sampling import disc, sobol
 from torchmpm.state import ParticleState
 from torchmpm.substep import Components, Scene, substep
 from torchmpm.tree import transforming
@@ -39,8 +44,8 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
-            (operator by operator), or ``"auto"``: native on a CPU where it works, else eager.
+        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, CUDA C++ on a GPU), ``"eager"``
+            (operator by operator), or ``"auto"``: native where it works, else eager.
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`, and gravity with which a particle at rest crosses a
             cell of the grid within a substep.
 
@@ -212,7 +217,7 @@ class Solver:
         if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
             raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
         leave_parent_threads()
-        substeps, segment = check_repetition(substeps, segment, "substeps")
+        substeps, segment = checks.whole("substeps", substeps, 0), checks.segment(segment)
         origin = self.check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
@@ -236,22 +241,22 @@ class Solver:
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
 
-        ``"auto"`` chooses them on the CPU wherever they work, and logs once why they do not. On CUDA only ``"native"``
-        does.
+        ``"auto"`` chooses them wherever they work, and logs once why they do not. On CUDA they must first agree with
+        the eager backend on a small scene, see :func:`kernels_fail`.
 
         Raises:
             ValueError: The backend is ``"native"`` and cannot run this.
         """
         if self.backend == "eager":
             return False
-        reason = self._not_native(state.device, self._has_tangents(state, *fields))
+        reason = self._not_native(state, *fields)
         if self.backend == "native":
             if reason is not None:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
             return True
         if reason is None and state.device.type == "cuda":
-            reason = "on CUDA the native backend runs only if backend='native' asks for it"
-        if reason is None:
+            reason = kernels_fail(state.device, state.dtype)
+        elif reason is None:
             try:
                 load(state.dtype)
             except ValueError as error:
@@ -268,16 +273,18 @@ class Solver:
 
     def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
-        tensors = tree.leaves((state, fields, self.constants))
-        return not transforming() and any(unpack_dual(tensor).tangent is not None for tensor in tensors)
+        tensors = (*vars(state).values(), *fields, *self.constants.values())
+        return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
 
-    def _not_native(self, device: torch.device, tangents: bool) -> str | None:
-        """Why the kernels cannot run a step on a device, or ``None`` if they can."""
+    def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
+        """Why the kernels cannot run a step, or ``None`` if they can."""
         if type(self).substep is not Solver.substep:
             return f"it does not call {type(self).__name__}.substep"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
+        if self._has_tangents(state, *fields):
+            return "it has no forward-mode derivatives"
+        return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
         """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked."""
@@ -338,3 +345,37 @@ class Solver:
         if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
+
+
+@functools.cache
+def kernels_fail(device: torch.device, dtype: torch.dtype = torch.float32) -> str | None:
+    """Why the native kernels are not to be used on a device, or ``None``; found out once in a process.
+
+    A disc with muscles that hits the ground takes a few substeps with them and with the eager backend. Its state, and
+    derivatives of a number that depends on all of it, must agree.
+    """
+    if device.type == "cuda" and (reason := unavailable(device)) is not None:
+        return reason
+    body = Body(2000, VonMises(*lame(young=1e3, poisson=0.3), 20.0), mass=4e-3, volume=1.6e-5, muscle=True)
+    ground = VelocityRule("-y", j=(None, 5))
+    solver = Solver(Grid(64), (body,), (0.0, -9.8), rules=(ground,), backend="eager")
+    options = {"dtype": dtype, "device": device}
+    found = []
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            points, origin = disc(sobol(2000, seed=0), centre=(0.5, 0.14), radius=0.1), torch.zeros(1, 2, **options)
+            for step in (partial(solver.kernels.step, gravity=solver.gravity), solver.step):
+                x = torch.tensor(points, **options).requires_grad_()
+                field = (30.0 * torch.arange(2 * 64**2, **options).sin()).view(1, 2, 64, 64).requires_grad_()
+                start = replace(ParticleState.at_rest(x), v=torch.full_like(x, -1.0)[None])
+                end = step(start, field, origin=origin, substeps=5)
+                loss = end.x.square().sum() + end.v.square().sum() + end.F.square().sum()
+                found.append((end.x, end.v, end.F, *torch.autograd.grad(loss, (x, field))))
+    except (ValueError, RuntimeError) as error:  # they cannot be compiled, or not launched
+        return f"its kernels were tried on {device}, and failed: {error}"
+    names = ("x", "v", "F", "the gradient in x", "the gradient in the field")
+    for name, ours, theirs in zip(names, *found, strict=True):
+        difference = float((ours - theirs).detach().abs().max() / theirs.detach().abs().max())
+        if not difference <= (3e-4 if dtype == torch.float32 else 1e-9):
+            return f"its kernels were tried on {device}, and {name} differed by {difference:.1e} from that of eager"
+    return None

@@ -156,7 +156,6 @@ TYPES = {
     "state": [
         lambda: step(torch.zeros(1, 5, 2)),
         lambda: diagnostics.elastic_energy(solver(), 5),
-        lambda: diagnostics.finite(None),
         lambda: diagnostics.impulses(solver(), "x"),
     ],
     "solver": [lambda: diagnostics.momentum(None, lively(5))],

@@ -57,11 +57,11 @@ def test_energies(state: ParticleState) -> None:
 @pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp"])
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_finite(state: ParticleState, name: str, number: float) -> None:
-    assert diagnostics.finite(state).tolist() == [True, True]
+    assert state.is_finite().tolist() == [True, True]
     field = getattr(state, name).clone()
     field[1, -1] = number
     broken = ParticleState(**{n: getattr(state, n) for n in ("x", "v", "C", "F", "Jp")} | {name: field})
-    assert diagnostics.finite(broken).tolist() == [True, False]
+    assert broken.is_finite().tolist() == [True, False]
 
 
 def test_impulses_of_gravity_and_damping(state: ParticleState) -> None:

@@ -12,7 +12,6 @@ from torch import Tensor
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
-from torchmpm.native.cpu import call
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -212,10 +211,10 @@ def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """To keep the tape within bounds; the gradients are the same."""
     given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
     whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
-    calls, step = [], kernels.native_step
-    monkeypatch.setattr(kernels, "native_step", lambda *arguments: calls.append(arguments[-1]) or step(*arguments))
+    calls, forward = [], kernels.forward
+    monkeypatch.setattr(kernels, "forward", lambda *arguments: calls.append(arguments[-1]) or forward(*arguments))
     limit = solvers(60, 2)["three bodies"].kernels.tape_limit(torch.empty(13, 2, 60).double())
-    monkeypatch.setattr(call, "KEPT_BYTES", 4 * call.KEPT_BYTES // limit)
+    monkeypatch.setattr(kernels, "KEPT_BYTES", 4 * kernels.KEPT_BYTES // limit)
     cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
     assert calls == [4, 4, 2]
     assert_gradients_close(cut, whole, 1e-14)
@@ -227,26 +226,3 @@ def test_second_derivatives_are_refused() -> None:
     (first,) = torch.autograd.grad(final.x.square().sum(), v, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(first.sum(), v)
-
-
-def operator_arguments() -> tuple[Solver, tuple[object, ...]]:
-    """A solver, and the arguments of the operator as its step passes them."""
-    seen, step = [], kernels.native_step
-    state, field, origin = moving(30, 2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "native_step", lambda *arguments: seen.append(arguments) or step(*arguments))
-        solver = replace(solvers(30, 2)["tensor values"], backend="native")
-        solver.step(state, field, substeps=2, origin=origin)
-    (arguments,) = seen
-    return solver, arguments
-
-
-def test_operator_keeps_the_rules_of_torch() -> None:
-    """Schema, fake tensors, and autograd, as torch.library.opcheck knows them."""
-    solver, given = operator_arguments()
-    assert given[-2] == solver.kernels.tables.handle
-    arguments = [
-        a.clone().requires_grad_() if isinstance(a, Tensor) and k in (0, 1, 4) else a for k, a in enumerate(given)
-    ]
-    tests = ("test_schema", "test_autograd_registration", "test_faketensor")
-    torch.library.opcheck(kernels.native_step, tuple(arguments), test_utils=tests)

@@ -1,14 +1,12 @@
 """Compiling the kernels: once per machine, safely, and with clear words where it cannot be done."""
 
 import ctypes
-import gc
 import os
 import stat
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +14,7 @@ import torch
 from scenes import lively, robot
 
 from torchmpm.backends import compiler_found
-from torchmpm.native.cpu import compiler, library
-from torchmpm.native.tables import tables_of
+from torchmpm.native import library
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +28,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 def forget() -> None:
     """As in the next process."""
-    library._load.cache_clear()
+    library._compiled.cache_clear()
     library.build.cache_clear()
 
 
@@ -128,8 +125,8 @@ def test_another_processor_or_option_is_another_file(
     quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     library.load(torch.float32)
-    for module, name, value in ((library, "processor", lambda: "another processor"), (compiler, "_FLAGS", ("-O0",))):
-        monkeypatch.setattr(module, name, value)
+    for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
+        monkeypatch.setattr(library, name, value)
         forget()
         library.load(torch.float32)
     assert runs(tmp_path) == 3
@@ -153,7 +150,7 @@ def test_kernels_of_the_package_come_first(
     source = tmp_path / "package" / "some.cpp"
     source.parent.mkdir()
     source.write_text("// nothing")
-    path = compiler.compiled_path(source, ["-DA"], str(library.family()))
+    path = library.compiled_path(source, ["-DA"], str(library.family()))
     path.write_bytes(b"of another system")
     library.build(source, "-DA")
     assert runs(tmp_path) == 1
@@ -192,17 +189,3 @@ def test_a_forked_process_that_does_not_simulate_keeps_its_threads() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.stdout == "31\n", done.stderr
-
-
-def test_tables_live_as_long_as_their_solvers_and_graphs() -> None:
-    solver, state = robot(5, backend="native", dt=7e-5), lively(5)
-    handle, v = solver.kernels.tables.handle, state.v.clone().requires_grad_()
-    final = solver.step(replace(state, v=v))
-    del solver
-    gc.collect()
-    assert tables_of(handle).dt == 7e-5
-    final.x.sum().backward()
-    del final
-    gc.collect()
-    with pytest.raises(KeyError):
-        tables_of(handle)

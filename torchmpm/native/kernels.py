@@ -1,10 +1,9 @@
-"""The kernels of a solver: whether they can run, a step through them, and the operators of torch that it calls."""
+"""The kernels of a solver: whether they can run, a step through them with its derivative, and the call into C++."""
 
+import ctypes
 import functools
-import importlib.util
-import os
-import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,30 +11,26 @@ import torch
 from torch import Tensor
 
 from torchmpm import tree
-from torchmpm.boundary import VelocityRule, node_shift
+from torchmpm.boundary import VelocityRule
+from torchmpm.checks import Segment
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
-from torchmpm.native.cpu import call
-from torchmpm.native.tables import (
-    KINDS,
-    Cotangents,
-    Inputs,
-    Tables,
-    bodies_of,
-    make_tables,
-    make_values,
-    tables_of,
-    upload,
-)
-from torchmpm.rollout import Segment
+from torchmpm.native.cuda.compiler import unavailable
+from torchmpm.native.cuda.launcher import CUDA
+from torchmpm.native.library import POOL, load, thread_pool
+from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
 from torchmpm.state import ParticleState
 
 #: A node remembers its rule for each direction in one byte, in which 0 stands for none.
 MAX_RULES = 255
 #: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
-#: The tape on CUDA takes no more than this, bytes.
-CUDA_TAPE_BYTES = 2**31
+#: Scratch memory of the CPU up to this size, bytes, is kept for the next call, as fresh pages cost a third of a
+#: backward pass. It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps
+#: are cut. Simulations that run at the same time share it.
+KEPT_BYTES = 2**28
+#: Share of a GPU's memory that the tape of one simulation may take; as many at once as fit have one.
+CUDA_TAPE_SHARE = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +49,11 @@ class Kernels:
         if device.type not in ("cpu", "cuda"):
             return f"its kernels run on the CPU and on CUDA, the state is on {device}"
         if device.type == "cuda":
-            missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
+            missing = unavailable(device)
             if missing is not None:
                 return missing
-            if torch.get_deterministic_debug_mode() == 2:  # not allowed, rather than warned of
-                return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
+            if torch.get_deterministic_debug_mode() == 2 and torch.is_grad_enabled():  # not allowed, or warned of
+                return "gradients on CUDA add in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
         return self._unsupported
 
     @functools.cached_property
@@ -80,7 +75,7 @@ class Kernels:
 
     @functools.cached_property
     def tables(self) -> Tables:
-        """All but the values, see :func:`torchmpm.native.tables.make_tables`."""
+        """All of the solver but the values of its materials."""
         return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     def values(self, like: Tensor) -> Tensor:
@@ -90,7 +85,7 @@ class Kernels:
             return self._kept[key]
         values = make_values(self.bodies, self.dt, self.grid.h, like)
         numbers = not any(isinstance(v, Tensor) for body in self.bodies for v in body.constants().values())
-        if numbers and type(values) is Tensor:  # fake tensors of a trace must not be kept
+        if numbers:
             with torch.inference_mode(False):  # a tensor made in inference mode could not serve gradients later
                 self._kept[key] = values = values.clone()
         return values
@@ -105,131 +100,150 @@ class Kernels:
         segment: Segment = "auto",
     ) -> ParticleState:
         """Advance a state (B, N) whose arguments were checked; see :meth:`torchmpm.Solver.step`."""
-        origin = origin.contiguous()
-        actuation = None if actuation is None else actuation.contiguous()
         given = gravity if isinstance(gravity, Tensor) else upload(tuple(gravity), state.dtype, state.device)
-        gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
-        values, shift = self.values(state.Jp), node_shift(self.grid, origin)
-        components = state.stack()
-        if torch.is_grad_enabled():
-            tensors = components, actuation, origin, gravity, values, shift
-            components, actuation, origin, gravity, values, shift = tree.without_inference(tensors)
-        # With gradients a call keeps its start and needs a tape of all its substeps later, whose size must be bounded.
-        limit = self.tape_limit(components, segment) if torch.is_grad_enabled() else substeps
+        gravity = given.to(state.Jp).expand(state.batch_size, 2)
+        values, shift = self.values(state.Jp), self.grid.node_shift(origin)
+        inputs = tree.map(Tensor.contiguous, Inputs(state.stack(), actuation, origin, gravity, values, shift))
+        limit = substeps
+        if torch.is_grad_enabled():  # a piece keeps its start, and needs a tape of all its substeps later
+            inputs, limit = tree.without_inference(inputs), self.tape_limit(inputs.components, segment)
         for start in range(0, substeps, limit):
-            length = min(limit, substeps - start)
-            components = native_step(components, actuation, origin, gravity, values, shift, self.tables.handle, length)
-        return ParticleState.from_stack(components)
+            components = Step.apply(self.tables, min(limit, substeps - start), *inputs[:6])
+            inputs = inputs._replace(components=components)
+        return ParticleState.from_stack(inputs.components)
 
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
+        rows, batch, particles = components.shape
+        substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
         if components.is_cuda:
-            limit = CUDA_TAPE_BYTES // (components.element_size() * components.numel())
+            memory = torch.cuda.get_device_properties(components.device).total_memory
+            limit = int(CUDA_TAPE_SHARE * memory) // substep
         else:
-            rows, batch, particles = components.shape
-            substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
-            limit = call.KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
+            limit = KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
 
 
-@functools.cache
-def triton_missing(compiler: str | None, path: str | None) -> str | None:
-    """Why Triton cannot work, or ``None`` if it can, with $CC and $PATH as given."""
-    if importlib.util.find_spec("triton") is None:
-        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
-    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
-        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
-    return None
+class Step(torch.autograd.Function):
+    """Some substeps. Autograd keeps their start; the backward pass replays them onto a tape, then goes back."""
+
+    @staticmethod
+    def forward(ctx: Any, tables: Tables, substeps: int, *tensors: Any) -> Tensor:
+        """New components (13, B, N), from the tensors of :class:`Inputs`."""
+        ctx.tables, ctx.substeps = tables, substeps
+        ctx.save_for_backward(*tensors)
+        return forward(Inputs(*tensors), tables, substeps)
+
+    @staticmethod
+    def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
+        """Derivatives in the tensors of :class:`Inputs` from that in the new components."""
+        tensors, (_, wants_field, _, _, wants_values) = ctx.saved_tensors, ctx.needs_input_grad[2:7]
+        found = Adjoint.apply(ctx.tables, ctx.substeps, wants_field, wants_values, *tensors, result_bar)
+        *bars, values_bar = (bar if bar.numel() else None for bar in found)
+        if values_bar is not None:
+            values_bar = _sum_shared(values_bar, tensors[4], ctx.tables)
+        return None, None, *bars, values_bar, None
 
 
-_INPUTS = "Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
-_NUMBERS = "int handle, int substeps"
+class Adjoint(torch.autograd.Function):
+    """The derivative of :class:`Step`, which has none of its own."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, tables: Tables, substeps: int, wants_field: bool, wants_values: bool, *tensors: Any
+    ) -> tuple[Tensor, ...]:
+        """Derivatives as :meth:`Inputs.empty_cotangents` lists them."""
+        return backward(tree.map(Tensor.contiguous, Inputs(*tensors)), tables, substeps, wants_field, wants_values)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> Any:
+        """Refused: only the plain operations have second derivatives."""
+        raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
 
 
-@torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
-def native_step(*arguments: Any) -> Tensor:
-    """Components (13, B, N) after some substeps, from the tensors of Inputs, the handle of Tables, and their number."""
-    *tensors, handle, substeps = arguments
-    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
+    """Components (13, B, N) after some substeps."""
+    if inputs.components.is_cuda:
+        return CUDA.forward(inputs, tables, substeps)
     result = torch.empty_like(inputs.components)
-    call.run(inputs, handle, substeps, result=result)
+    call("torchmpm_forward", inputs, tables, substeps, result=result)
     return result
 
 
-@torch.library.custom_op(
-    "torchmpm::native_step_backward",
-    mutates_args=(),
-    schema=(
-        f"({_INPUTS}, Tensor result_bar, {_NUMBERS}, bool wants_field, bool wants_values) "
-        "-> (Tensor, Tensor, Tensor, Tensor, Tensor)"
-    ),
-)
-def native_step_backward(*arguments: Any) -> Cotangents:
-    """Replay the substeps, then go back.
-
-    The arguments are tensors, handle, substeps, and whether to compute derivatives in the field and in the values.
-    """
-    *tensors, handle, substeps, wants_field, wants_values = arguments
-    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
-    cotangents = inputs.empty_cotangents(wants_field, wants_values)
-    wanted = {n: bar for n, bar in zip(call.COTANGENTS, cotangents, strict=True) if bar.numel()}
-    call.run(inputs, handle, substeps, **wanted)
-    return cotangents
+def backward(
+    inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool
+) -> tuple[Tensor, ...]:
+    """Replay the substeps, then go back; derivatives as :meth:`Inputs.empty_cotangents` lists them."""
+    if inputs.components.is_cuda:
+        return CUDA.backward(inputs, tables, substeps, wants_field, wants_values)
+    bars = inputs.empty_cotangents(wants_field, wants_values)
+    wanted = {name: bar for name, bar in zip(COTANGENTS, bars, strict=True) if bar.numel()}
+    call("torchmpm_backward", inputs, tables, substeps, **wanted)
+    return bars
 
 
-@native_step.register_kernel("cuda")
-def _(*arguments: Any) -> Tensor:
-    from torchmpm.native import cuda  # not at the top: it imports Triton
-
-    return cuda.forward(*arguments)
-
-
-@native_step_backward.register_kernel("cuda")
-def _(*arguments: Any) -> Cotangents:
-    from torchmpm.native import cuda
-
-    return cuda.backward(*arguments)
-
-
-@native_step.register_fake
-def _(components: Tensor, *_: object) -> Tensor:
-    return torch.empty_like(components, memory_format=torch.contiguous_format)
-
-
-@native_step_backward.register_fake
-def _(*arguments: Any) -> Cotangents:
-    *tensors, _handle, _substeps, wants_field, wants_values = arguments
-    return Inputs(*tensors).empty_cotangents(wants_field, wants_values)
-
-
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, ctx.handle, ctx.substeps = inputs
-    ctx.tables = tables_of(ctx.handle)  # the solver may be gone when the backward pass needs them
-    ctx.save_for_backward(*tensors)
-
-
-def _backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
-    saved, wanted = ctx.saved_tensors, ctx.needs_input_grad[:5]
-    wants_field, wants_values = wanted[1], wanted[4]
-    *found, values_bar = native_step_backward(*saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values)
-    found.append(_sum_shared(values_bar, saved[4], ctx.handle) if wants_values else None)
-    return (*(bar if wants else None for bar, wants in zip(found, wanted, strict=True)), None, None, None)
-
-
-def _sum_shared(bar: Tensor, values: Tensor, handle: int) -> Tensor:
+def _sum_shared(bar: Tensor, values: Tensor, tables: Tables) -> Tensor:
     """Sum derivatives per particle (8, B, N) over the particles and simulations that share a value."""
     if values.shape[1] == 1:
         bar = bar.sum(1, keepdim=True)
     columns = []
-    for body in bodies_of(handle):
+    for body in tables.bodies[: tables.num_bodies]:
         part = bar[:, :, body.first : body.first + body.count]
         columns.append(part if body.varying else part.sum(2, keepdim=True))
     return torch.cat(columns, dim=2)
 
 
-def _no_second_derivative(ctx: Any, *_: Tensor) -> None:
-    raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
+#: Derivatives that the adjoint in C++ writes.
+COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
-native_step.register_autograd(_backward, setup_context=_setup_context)
-native_step_backward.register_autograd(_no_second_derivative)
+class Call(ctypes.Structure):
+    """The arguments of a call into C++, as ``struct Call`` in ``scene.hpp``."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("batch", "particles", "substeps", "threads")),
+        *((name, ctypes.c_void_p) for name in POOL),
+        ("tables", ctypes.POINTER(Tables)),
+        *((name, ctypes.c_void_p) for name in ("components", "field", "origin", "shift", "gravity", "values")),
+        *((name, ctypes.c_int64) for name in ("values_batch", "columns")),
+        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *COTANGENTS)),
+    ]
+
+
+def call(name: str, inputs: Inputs, tables: Tables, substeps: int, **outputs: Tensor) -> None:
+    """Call a function of ``native.cpp``, which writes the ``outputs``."""
+    library, (_, batch, particles) = load(inputs.components.dtype), inputs.components.shape
+    arguments = Call(
+        batch=batch,
+        particles=particles,
+        substeps=substeps,
+        threads=torch.get_num_threads(),
+        tables=ctypes.pointer(tables),
+        values_batch=inputs.values.shape[1],
+        columns=inputs.values.shape[2],
+        **thread_pool(),
+        **{name: tensor.data_ptr() for name, tensor in (inputs._asdict() | outputs).items() if tensor is not None},
+    )
+    function, measure = getattr(library, name), getattr(library, f"{name}_bytes")
+    measure.restype = ctypes.c_size_t
+    with _scratch(measure(ctypes.byref(arguments))) as scratch:
+        if function(ctypes.byref(arguments), ctypes.c_void_p(scratch)):
+            raise MemoryError("backend 'native' ran out of memory")
+
+
+_kept: list[Tensor] = []
+
+
+@contextmanager
+def _scratch(size: int) -> Iterator[int]:
+    """Address of ``size`` bytes of aligned memory."""
+    try:
+        buffer = _kept.pop()
+    except IndexError:
+        buffer = torch.empty(0, dtype=torch.uint8, device="cpu")
+    if buffer.numel() < size + 64:
+        del buffer
+        buffer = torch.empty(size + 64, dtype=torch.uint8, device="cpu")
+    yield (buffer.data_ptr() + 63) // 64 * 64
+    if buffer.numel() <= KEPT_BYTES and not _kept:
+        _kept.append(buffer)

@@ -1,0 +1,56 @@
+"""Drivers that stand for a GPU: tensors on the CPU go through the launcher of the CUDA kernels."""
+
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+from torchmpm.native import kernels
+from torchmpm.native.cuda.arguments import Arguments, Kernel
+from torchmpm.native.cuda.driver import Card, Driver, Launch
+from torchmpm.native.cuda.launcher import Launcher
+
+H100 = Card(multiprocessors=132, shared_bytes=232_448)
+RTX_4090 = Card(multiprocessors=128, shared_bytes=101_376)
+
+
+class Recorded(NamedTuple):
+    """A launch as a driver was asked for it."""
+
+    kernel: Kernel
+    launch: Launch
+    arguments: Arguments
+    device: torch.device
+
+
+class Recorder:
+    """Launches nothing, and keeps what it was to launch."""
+
+    def __init__(self, card: Card = H100, blocks: int = 1) -> None:
+        self._card, self.blocks = card, blocks  # blocks that a multiprocessor holds at once
+        self.launches: list[Recorded] = []
+
+    def card(self, device: torch.device) -> Card:
+        return self._card
+
+    def load(self, kernel: Kernel, device: torch.device) -> Kernel:
+        return kernel
+
+    def resident(self, function: Kernel, threads: int, shared_bytes: int, device: torch.device) -> int:
+        return self.blocks * self._card.multiprocessors * (shared_bytes <= self._card.shared_bytes)
+
+    def launch(self, function: Kernel, launch: Launch, arguments: ctypes.Structure, device: torch.device) -> None:
+        self.launches.append(Recorded(function, launch, Arguments.from_buffer_copy(arguments), device))
+
+
+@contextmanager
+def in_use(driver: Driver) -> Iterator[Any]:
+    """Meanwhile, the native backend runs kernels of this driver on tensors of the CPU."""
+    launcher = Launcher(driver)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "forward", launcher.forward)
+        patch.setattr(kernels, "backward", launcher.backward)
+        yield driver
