@@ -26,7 +26,7 @@ COMPONENTS = 13
 #: Threads share the work of a sum in so many parts.
 SHARES = 32
 #: Numbers of a summary of a substep.
-SUMMARY = 7
+SUMMARY = 8
 
 
 def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:

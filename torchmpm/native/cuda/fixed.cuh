@@ -27,7 +27,7 @@ constexpr Real HEAVIER = !WIDE ? Real(1.5) : sizeof(Real) == 8 ? Real(2) : Real(
 // As many particles as a node may have before anything is known about it.
 constexpr Real CROWD = WIDE ? Real(1 << 30) : Real(1 << 12);
 // The least range of speeds: so many cells per substep.
-constexpr Real SLOWEST = Real(1) / 32;
+constexpr Real SLOWEST = Real(1) / 64;
 
 struct Scale {
     Real mass, momentum;            // units in one
