@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
+from torchmpm.native.cuda.arguments import COMPONENTS, COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.compiler import FOLDERS
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.cuda.launcher import Launcher
@@ -39,9 +39,9 @@ class Gpu:
         """See :class:`torchmpm.native.cuda.driver.Driver`."""
         return Card(multiprocessors=2, shared_bytes=100_000)
 
-    def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, bool]:
-        """The library with the kernel, and whether it is the adjoint."""
-        return library(*kernel[1:]), kernel.adjoint
+    def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, Kernel]:
+        """The library with a kernel."""
+        return library(*kernel[1:]), kernel
 
     def resident(self, function: Any, threads: int, shared_bytes: int, device: torch.device) -> int:
         """One block on each multiprocessor."""
@@ -53,11 +53,14 @@ class Gpu:
         Raises:
             Broken: Threads of a block came to different barriers, wait for ever, or wrote out of bounds.
         """
-        kernels, adjoint = function
+        kernels, kernel = function
         assert isinstance(arguments, Arguments)
         ctypes.memset(arguments.scratch, 0xCB, launch.blocks // arguments.team * arguments.scratch_bytes)
+        if arguments.result and (kernel.shared or not arguments.status):
+            size = COMPONENTS * arguments.batch * arguments.particles * kernel.real_bytes
+            ctypes.memset(arguments.result, 0xFF, size)  # NaN where nothing is written
         outcome = kernels.launch(
-            ctypes.byref(arguments), adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
+            ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
             ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
         )  # fmt: skip
         if outcome:
@@ -166,7 +169,9 @@ class Imitation(Launcher):
         for shared, team in ((True, 1), (False, plan.team)):
             if not (plan.shared if shared else team):
                 continue
-            kernel = Kernel(call.adjoint, shared, call.real, plan.threads, plan.per_thread, kinds=7, muscles=plan.muscles)
+            kernel = Kernel(
+                call.adjoint, shared, call.real, plan.threads, plan.per_thread, kinds=7, muscles=plan.muscles
+            )
             rows, columns = (min(n, call.width) if shared else call.width for n in plan.window)
             shared_bytes = kernel.shared_bytes(rows, columns, call.bodies, 16)
             scratch_bytes = kernel.scratch_bytes(rows, columns, call.resolution, call.particles, call.substeps)

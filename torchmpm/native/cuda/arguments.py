@@ -24,7 +24,7 @@ COUNTERS = 64
 #: Components of a particle's state.
 COMPONENTS = 13
 #: Threads share the work of a sum in so many parts.
-SHARES = 32
+SHARES = 16
 #: Numbers of a summary of a substep.
 SUMMARY = 8
 
