@@ -9,7 +9,7 @@ from native_scenes import NAMES, RULES, moving, solvers, values
 from scenes import lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, trajectory
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
 
@@ -185,26 +185,6 @@ def test_threads_and_batch_make_no_difference() -> None:
         torch.set_num_threads(before)
     for result in results[1:]:
         assert all(torch.equal(result[name], results[0][name]) for name in wanted)
-
-
-def test_checkpoints_of_a_trajectory() -> None:
-    """Steps nest in torchmpm.trajectory like those of the plain substep."""
-    state = lively(30)
-    fields = [(60.0 * normal(1, 2, 16, 16, seed=k)).requires_grad_() for k in range(3)]
-    results = []
-    for backend, checkpointed in (("eager", False), ("native", False), ("native", True)):
-        solver = robot(30, backend=backend)
-        final, _ = trajectory(
-            lambda s, a, solver=solver: solver.step(s, a, substeps=4),
-            state,
-            fields,
-            observe=lambda s: None,
-            checkpointed=checkpointed,
-        )
-        results.append(torch.autograd.grad(loss(final), fields))
-    for result in results[1:]:
-        for one, other in zip(result, results[0], strict=True):
-            torch.testing.assert_close(one, other, rtol=0, atol=1e-12 * other.abs().max().item())
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
