@@ -84,6 +84,12 @@ def robot_and_ball(robot_count: int, ball_count: int, **changes: object) -> Solv
     return robot(robot_count, bodies=(*robot(robot_count).bodies, ball), **changes)
 
 
+def combination(state: ParticleState, seed: int, **sizes: float) -> Tensor:
+    """A random combination of fields, each times a factor that brings them to one size, so that none drowns others."""
+    fields = enumerate((getattr(state, name), size) for name, size in sizes.items())
+    return sum(size * (normal(*t.shape, seed=seed + k).to(t) * t).sum() for k, (t, size) in fields)
+
+
 def assert_close(first: ParticleState, second: ParticleState, tolerance: float) -> None:
     """Compare all fields, relative to the largest number of each field."""
     for name in ("x", "v", "C", "F", "Jp"):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import lively, normal, robot
+from scenes import combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -69,10 +69,8 @@ def varied(count: int, given: Leaves) -> Solver:
 
 
 def loss(final: ParticleState) -> Tensor:
-    """A random combination of everything, brought to one size."""
-    sizes = {"x": 1.0, "v": 0.2, "C": 0.01, "F": 1.0, "Jp": 1.0}
-    fields = enumerate((getattr(final, name), size) for name, size in sizes.items())
-    return sum(size * (normal(*t.shape, seed=20 + k).to(t) * t).sum() for k, (t, size) in fields)
+    """A random combination of everything."""
+    return combination(final, 20, x=1.0, v=0.2, C=0.01, F=1.0, Jp=1.0)
 
 
 def gradients(

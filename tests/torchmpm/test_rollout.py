@@ -193,9 +193,9 @@ def peak_memory(substeps: int, segment: int | None, checkpointed: bool | None = 
             final = solver.step(start, substeps=substeps, segment=segment)
         else:
             final, _ = trajectory(
-                lambda s, _: solver.step(s, substeps=4, segment=segment),
+                lambda s, _: solver.step(s, substeps=2, segment=segment),
                 start,
-                range(substeps // 4),
+                range(substeps // 2),
                 observe=lambda s: None,
                 checkpointed=checkpointed,
             )
@@ -205,13 +205,13 @@ def peak_memory(substeps: int, segment: int | None, checkpointed: bool | None = 
 
 
 def test_checkpoints_bound_the_memory() -> None:
-    """Twenty substeps in segments of four need well under half of the whole graph, in both kinds of loop."""
-    whole = peak_memory(20, None)
-    assert whole > 1.8 * peak_memory(10, None), "without segments memory must grow with the number of substeps"
-    segmented = peak_memory(20, 4)
+    """Twelve substeps in segments of two need well under half of the whole graph, in both kinds of loop."""
+    whole = peak_memory(12, None)
+    assert whole > 1.8 * peak_memory(6, None), "without segments memory must grow with the number of substeps"
+    segmented = peak_memory(12, 2)
     assert segmented < 0.4 * whole
-    assert peak_memory(40, 4) < 1.4 * segmented
-    assert peak_memory(20, None, checkpointed=True) < 0.4 * whole
+    assert peak_memory(24, 2) < 1.4 * segmented
+    assert peak_memory(12, None, checkpointed=True) < 0.4 * whole
 
 
 @pytest.mark.parametrize("name", ["mu", "scale", "lam"])
