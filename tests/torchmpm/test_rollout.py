@@ -1,18 +1,20 @@
 """Loops over steps and their checkpoints, on a step simple enough to know the answer."""
 
 import gc
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from peak_memory import PeakMemory
-from scenes import Learned, Wrapped, lively, normal, robot
+from scenes import lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, repeated, trajectory
 from torchmpm.backends import compiler_found
+from torchmpm.materials.body import METHODS
 
 NATIVE = pytest.param("native", marks=pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"))
 CHANGED = "in.?place"
@@ -212,6 +214,31 @@ def test_checkpoints_bound_the_memory() -> None:
     assert segmented < 0.4 * whole
     assert peak_memory(24, 2) < 1.4 * segmented
     assert peak_memory(12, None, checkpointed=True) < 0.4 * whole
+
+
+class Learned(torch.nn.Module):
+    """A law whose stiffness is a parameter of a module."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mu = torch.nn.Parameter(torch.tensor([500.0], dtype=torch.float64))
+        self.register_buffer("scale", torch.ones(1, dtype=torch.float64))
+        self.lam = torch.tensor([50.0], dtype=torch.float64)
+        for name in METHODS:
+            setattr(self, name, partial(self.call, name))
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        return getattr(Elastic(self.mu * self.scale, self.lam), method)(*arguments)
+
+
+@dataclass
+class Wrapped:
+    """A law that holds another one."""
+
+    base: Learned
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.base, name)
 
 
 @pytest.mark.parametrize("name", ["mu", "scale", "lam"])
