@@ -4,8 +4,8 @@ There are four kernels, each compiled from a source of its own (:class:`Kernel`)
 a robot in shared memory or in global memory.
 
 - **Shared**: one block of threads advances one robot through all substeps, on a window of ``rows`` x ``columns`` nodes
-  that follows it. Any number of blocks can be launched (``team`` is 1): blocks take robots in turn. A robot that does not
-  fit the window, or whose numbers leave the range of the fixed-point sums, is given up: its ``status`` is not 0.
+  that follows it. Any number of blocks can be launched (``team`` is 1): blocks take robots in turn. A robot that does
+  not fit the window, or whose numbers leave the range of the fixed-point sums, is given up: its ``status`` is not 0.
 - **Global**: ``team`` blocks advance one robot together, on nodes in their scratch memory. They wait for each other, so
   all blocks must be resident: launch cooperatively, ``team`` times any number of teams. With ``status``, they take the
   robots that the kernel before gave up. With forward kernels, ``team * threads * per_thread`` particles must suffice.
@@ -18,14 +18,15 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from torchmpm.grid import PAD
-from torchmpm.native.tables import VALUES
 
 #: 32-bit counters of a team, which must be zero before a launch of a global kernel.
 COUNTERS = 64
 #: Components of a particle's state.
 COMPONENTS = 13
-#: Bytes of the tables in shared memory that do not depend on sizes.
-FIXED_SHARED_BYTES = 1024
+#: Threads share the work of a sum in so many parts.
+SHARES = 32
+#: Numbers of a summary of a substep.
+SUMMARY = 7
 
 
 def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
@@ -33,8 +34,10 @@ def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
 
 
 class Arguments(ctypes.Structure):
-    """The only argument of each kernel, as ``struct Arguments``; ``bodies`` and ``rules`` are the bytes of
-    :class:`torchmpm.native.tables.BodyTable` and ``RuleTable`` on the device."""
+    """The only argument of each kernel, as ``struct Arguments``.
+
+    ``bodies`` and ``rules`` are the bytes of :class:`torchmpm.native.tables.BodyTable` and ``RuleTable`` on the device.
+    """
 
     _fields_ = [
         *_members(ctypes.c_int64, "batch", "particles", "substeps", "resolution", "num_bodies", "num_rules"),
@@ -49,7 +52,7 @@ class Arguments(ctypes.Structure):
 
 
 class Kernel(NamedTuple):
-    """What a kernel is compiled for. Its name in the compiled module is ``torchmpm_forward`` or ``torchmpm_adjoint``."""
+    """What a kernel is compiled for."""
 
     adjoint: bool
     shared: bool  # nodes in shared memory
@@ -90,33 +93,31 @@ class Kernel(NamedTuple):
     def node_bytes(self) -> int:
         """Bytes of a node."""
         real = self.real_bytes
-        fixed = real if self.shared else 8
-        size = 3 * fixed + 2 * real  # mass and momentum, velocity
+        sums = 3 * real if self.shared else 4 * 8  # mass and momentum in fixed point
         if self.adjoint:
-            size = max(size, 7 * real)  # derivatives in the velocity, velocity, derivatives in momentum and mass
-        if self.muscles:
-            size += (4 if self.adjoint else 2) * real  # actuation, and the derivative in it
-        return size
+            sums = max(sums, 5 * real)  # derivatives in velocity, momentum and mass
+        fields = (2 if self.adjoint else 1) if self.muscles else 0  # actuation, and the derivative in it
+        return sums + 2 * real * (1 + fields)
 
-    def shared_bytes(self, rows: int, columns: int, bodies: int) -> int:
+    def shared_bytes(self, rows: int, columns: int, bodies: int, rules: int) -> int:
         """Dynamic shared memory of a block."""
-        tables = FIXED_SHARED_BYTES + bodies * (24 + (VALUES + 5) * self.real_bytes)
-        return _aligned(tables) + (rows * columns * self.node_bytes if self.shared else 0)
+        real = self.real_bytes
+        pieces = [
+            3 * 4 * SUMMARY + 4 * real + 4 * SHARES * real,
+            bodies * (24 + 13 * real),
+            rules * (36 if real == 4 else 48),
+        ]
+        return sum(map(_aligned, pieces)) + (rows * columns * self.node_bytes if self.shared else 0)
 
     def scratch_bytes(self, rows: int, columns: int, resolution: int, particles: int, substeps: int) -> int:
-        """Global memory of a team. ``rows`` and ``columns`` are ``resolution + 2 * PAD`` with nodes in global memory."""
-        cells, nodes = (resolution + 2 * PAD) ** 2, rows * columns
-        pieces = [4 * cells]  # which rules hold on each node
+        """Global memory of a team; with nodes in global memory, ``rows`` and ``columns`` are those of the whole grid."""
+        nodes, real = rows * columns, self.real_bytes
+        pieces = [4 * (resolution + 2 * PAD) ** 2]  # which rules hold on each node
         if not self.shared:
-            pieces += [nodes * self.node_bytes, _TEAM_BYTES]
-        if self.adjoint:
-            pieces += [substeps * COMPONENTS * particles * self.real_bytes, substeps * 3 * nodes * self.real_bytes]
-            pieces += [substeps * 32]
+            pieces += [nodes * self.node_bytes, 3 * 4 * SUMMARY]
+        if self.adjoint:  # the tape
+            pieces += [substeps * COMPONENTS * particles * real, substeps * 3 * nodes * real, substeps * 32]
         return sum(map(_aligned, pieces))
-
-
-#: What the blocks of a team tell each other.
-_TEAM_BYTES = 1024
 
 
 def _aligned(size: int) -> int:

@@ -193,9 +193,9 @@ private:
     INLINE static int64_t square_of(int64_t n) { return n * n; }
 
     template <bool adjoint> INLINE static size_t node_bytes() {
-        size_t size = 2 * sizeof(Real) + 4 * sizeof(Fixed);
-        if (adjoint && size < 7 * sizeof(Real)) size = 7 * sizeof(Real);
-        return size + (TORCHMPM_MUSCLES ? adjoint ? 4 : 2 : 0) * sizeof(Real);
+        size_t sums = (TORCHMPM_SHARED ? 3 : 4) * sizeof(Fixed);
+        if (adjoint && sums < 5 * sizeof(Real)) sums = 5 * sizeof(Real);
+        return sums + sizeof(Pair) * (TORCHMPM_MUSCLES ? adjoint ? 3 : 2 : 1);
     }
 
     INLINE Values read_values(int64_t column) const {
