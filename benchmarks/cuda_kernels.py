@@ -37,7 +37,7 @@ def launches() -> Iterator[tuple[str, Pass]]:
     for adjoint in (False, True):
         for real in ("float", "double"):
             for scene, (particles, bodies, kinds) in SCENES.items():
-                call = Call(adjoint, real, 1, particles, 100, 128, bodies, kinds, muscles=True)
+                call = Call(adjoint, real, 1, particles, 100, 128, bodies, 4, kinds, muscles=True)
                 for one in passes(call, card, lambda kernel, size: card.multiprocessors):
                     yield scene, one
 

@@ -50,7 +50,7 @@ def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
     assert first.kernel.shared and not first.launch.cooperative
     assert (first.launch.blocks, first.launch.threads) == (64, 512)
     assert USUAL_SHARED_BYTES < first.launch.shared_bytes <= H100.shared_bytes
-    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1)
+    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1, 1)
     assert first.kernel.threads * first.kernel.per_thread >= 2000
     assert not second.kernel.shared and second.launch.cooperative
     assert second.arguments.rows == second.arguments.columns == Grid(128).width
