@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-import torch
 from cuda_drivers import Imitation, in_use
 from native_scenes import NAMES, moving, solvers
 from scenes import assert_close
