@@ -57,7 +57,7 @@ KERNEL void torchmpm_forward(const GRID_CONSTANT Arguments given) {
         robot.prepare(element);
         particles.load();
         const int failure = advance(robot, substep, particles, NoTape{});
-        if (TORCHMPM_SHARED && THREAD == 0) given.status[element] = failure;
+        if (TORCHMPM_SHARED && given.status && THREAD == 0) given.status[element] = failure;
         if (failure) continue;
         if (given.substeps > 0) particles.each(0, [&](Particle& p, int, int) { substep.take(p); });
         particles.store();
