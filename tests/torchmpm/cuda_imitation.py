@@ -86,6 +86,7 @@ class Plan:
     team: int = 0  # blocks for each robot, with nodes in global memory; 0: these are not used
     teams: int = 2  # robots at a time
     window: tuple[int, int] = (10**6, 10**6)  # nodes in shared memory, at most
+    muscles: bool = True  # kernels for muscles, also where no body has any
 
 
 class Imitation(Launcher):
@@ -100,7 +101,7 @@ class Imitation(Launcher):
         for shared, team in ((True, 1), (False, plan.team)):
             if not (plan.shared if shared else team):
                 continue
-            kernel = Kernel(call.adjoint, shared, call.real, THREADS, PER_THREAD, kinds=7, muscles=call.muscles)
+            kernel = Kernel(call.adjoint, shared, call.real, THREADS, PER_THREAD, kinds=7, muscles=plan.muscles)
             rows, columns = (min(n, call.width) if shared else call.width for n in plan.window)
             shared_bytes = kernel.shared_bytes(rows, columns, call.bodies, 16)
             scratch_bytes = kernel.scratch_bytes(rows, columns, call.resolution, call.particles, call.substeps)

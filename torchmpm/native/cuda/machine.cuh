@@ -10,8 +10,7 @@ enum Barrier : int {
     GIVEN,      // P2G: all particles have given mass and momentum to the nodes
     MOVED,      // all nodes have their velocities
     ASSEMBLED,  // the blocks of a team have waited for each other
-    REVERSED,   // adjoint: all nodes have passed on their derivatives
-    FLUSHED,    // adjoint: derivatives in the actuation have left the window
+    REVERSED,   // adjoint: all particles have passed on their derivatives
     SUMMED,     // adjoint: the threads' shares of a sum are there
     BARRIERS
 };
@@ -28,6 +27,7 @@ enum Atomic : int {
     ADD_VELOCITY_BAR_Y,
     ADD_FIELD_BAR_X,
     ADD_FIELD_BAR_Y,
+    ADD_SHARE,        // threads of a block
     ADD_SUM,          // blocks of a team
     ATOMICS
 };

@@ -12,6 +12,12 @@ struct alignas(2 * sizeof(Real)) Pair {
 
 constexpr int SHARES = 32;
 
+// Whether a body has a material; decided by the compiler where all bodies have the same.
+template <Kind kind> INLINE bool has_kind(int other) {
+    constexpr int bit = 1 << int(kind);
+    return TORCHMPM_KINDS == bit || (TORCHMPM_KINDS & bit && other == int(kind));
+}
+
 // In shared memory. The layouts are those that torchmpm/native/cuda/arguments.py counts.
 struct Body {
     int first, count, kind, muscle, varying, column;

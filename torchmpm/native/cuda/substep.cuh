@@ -142,8 +142,8 @@ private:
 
     INLINE Sym2 deform_as(int kind, const Values& m, const Bounds& bounds, Mat2 C, Pair act, Mat2& F, Real& Jp) const {
         const Real dt = robot.dt;
-        if (has<Kind::von_mises>(kind)) return deform<Kind::von_mises>(dt, m, bounds, C, act.x, act.y, F, Jp);
-        if (has<Kind::snow>(kind)) return deform<Kind::snow>(dt, m, bounds, C, act.x, act.y, F, Jp);
+        if (has_kind<Kind::von_mises>(kind)) return deform<Kind::von_mises>(dt, m, bounds, C, act.x, act.y, F, Jp);
+        if (has_kind<Kind::snow>(kind)) return deform<Kind::snow>(dt, m, bounds, C, act.x, act.y, F, Jp);
         return deform<Kind::elastic>(dt, m, bounds, C, act.x, act.y, F, Jp);
     }
 
@@ -196,9 +196,5 @@ private:
         if (record) tape.x[node] = momentum[0] * inverse, tape.y[node] = momentum[1] * inverse, tape.inverse[node] = inverse;
     }
 
-    template <Kind kind> INLINE static bool has(int other) {
-        constexpr int bit = 1 << int(kind);
-        return TORCHMPM_KINDS == bit || (TORCHMPM_KINDS & bit && other == int(kind));
-    }
     INLINE static Real not_a_number() { return Real(__builtin_bit_cast(float, 0x7fffffff)); }
 };
