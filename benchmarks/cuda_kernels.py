@@ -1,21 +1,21 @@
 """Registers, spills and shared memory of every CUDA kernel on four generations of cards, compiled without a GPU.
 
-`python benchmarks/cuda_kernels.py --out docs/cuda-kernels.csv` compiles with NVRTC (`pip install 'torchmpm[cuda13]'`)
-what calls of the usual sizes launch, and writes a row for each kernel. It fails where one does not compile.
+`python benchmarks/cuda_kernels.py --out docs/cuda-kernels.json` compiles with NVRTC (`pip install 'torchmpm[cuda13]'`)
+what steps of the usual sizes launch, and writes a row for each kernel. It fails where one does not compile.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import io
+import json
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from torchmpm.native.cuda.arguments import Kernel
-from torchmpm.native.cuda.compiler import compile_source, source_of
+from torchmpm.native.cuda.compiler import compile_source, digest_of_sources, source_of
 from torchmpm.native.cuda.driver import Card
 from torchmpm.native.cuda.plan import Call, Pass, passes
 
@@ -37,7 +37,7 @@ def launches() -> Iterator[tuple[str, Pass]]:
     for adjoint in (False, True):
         for real in ("float", "double"):
             for scene, (particles, bodies, kinds) in SCENES.items():
-                call = Call(adjoint, real, 1, particles, 100, 128, bodies, kinds, muscles=True)
+                call = Call(adjoint, real, 1, particles, 100, 128, bodies, 4, kinds, muscles=True)
                 for one in passes(call, card, lambda kernel, size: card.multiprocessors):
                     yield scene, one
 
@@ -76,7 +76,7 @@ def rows(architectures: list[str]) -> Iterator[dict[str, str]]:
 def main() -> int:
     """Compile everything; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="CSV file to write")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--arch", nargs="+", choices=ARCHITECTURES, default=list(ARCHITECTURES))
     args = parser.parse_args()
     table = []
@@ -84,10 +84,7 @@ def main() -> int:
         table.append(row)
         print(", ".join(row.values()), flush=True)
     if args.out is not None:
-        with args.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, table[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(table)
+        args.out.write_text(json.dumps({"sources": digest_of_sources(), "rows": table}, indent=1) + "\n")
     return 0
 
 

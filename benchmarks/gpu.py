@@ -399,8 +399,9 @@ def memory(lab: Lab) -> Figures:
         for k in range(4 if lab.tiny else 50):
             action = actions(env, k).requires_grad_(gradient)
             with torch.set_grad_enabled(gradient):
-                env.step(action, soft=gradient)[1].sum()
+                reward = env.step(action, soft=gradient)[1]
             if gradient:
+                torch.autograd.grad(reward.sum(), action)
                 env.detach()
             used.append(torch.cuda.memory_allocated() / 1e6 if lab.device == "cuda" else 0.0)
         name = f"growth (MB){', with gradients' * gradient}"
@@ -525,8 +526,9 @@ def training(lab: Lab) -> Iterator[Check]:
 
 def train_options(lab: Lab, learner: str, steps: int) -> list[str]:
     """A training in one stage; of SHAPE MATCH on the imitation, where its episodes are short."""
-    words = f"--task {'shapematch' if lab.tiny else 'run'} --learner {learner} --steps {steps} --resolutions 4 --handover --no-video --eval-every 0"
-    words += f" --eval-episodes 1 --device {lab.device}"
+    task = "shapematch" if lab.tiny else "run"
+    words = f"--task {task} --learner {learner} --steps {steps} --resolutions 4 --handover"
+    words += f" --no-video --eval-every 0 --eval-episodes 1 --device {lab.device}"
     if not lab.tiny:
         return words.split() + (["--num-envs", "1024"] if learner == "sac" else ["--num-envs", "64"])
     words += " --particles 60 --substeps 2 --num-envs 2 --log-every 4 --random-steps 4 --batch-size 4 --update-start 4"
@@ -670,7 +672,7 @@ class Report:
         os.replace(fresh, self.path)
         shown = ", ".join(f"{name} {short(value)}" for name, value in row["figures"].items())
         mark, what = ("FAILED", "; ".join(row["wrong"])) if row["wrong"] else ("ok", shown)
-        print(f"{row['stage']:9}{mark:7}{row['check']}: {what}"[:400], flush=True)
+        print(" ".join(f"{row['stage']:9}{mark:7}{row['check']}: {what}"[:400].splitlines()), flush=True)
 
 
 def short(value: Any) -> str:
@@ -684,8 +686,9 @@ def follow(command: list[str], stage: str, seconds: float, report: Report) -> in
     lines: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
-        for line in child.stdout:
-            lines.put(line)
+        with child.stdout:
+            for line in child.stdout:
+                lines.put(line)
         lines.put(None)
 
     threading.Thread(target=read, daemon=True).start()

@@ -253,6 +253,12 @@ def gpu_line() -> str:
     return markdown(columns, [[run["card"], *cells]])
 
 
+def cuda_kernels() -> str:
+    """Registers, spills and shared memory of the CUDA kernels."""
+    rows = json.loads((DOCS / "cuda-kernels.json").read_text())["rows"]
+    return markdown(list(rows[0]), (list(row.values()) for row in rows))
+
+
 def from_csv(name: str) -> str:
     """A CSV file as it is."""
     rows = read(name)
@@ -357,6 +363,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "best-rewards": best_rewards,
     "constants": constants,
     "csv": from_csv,
+    "cuda-kernels": cuda_kernels,
     "geometry": geometry,
     "gpu": gpu,
     "gpu-line": gpu_line,

@@ -351,24 +351,26 @@ class Solver:
 def kernels_fail(device: torch.device, dtype: torch.dtype = torch.float32) -> str | None:
     """Why the native kernels are not to be used on a device, or ``None``; found out once in a process.
 
-    A disc with muscles that hits the ground takes a few substeps with them and with the eager backend. Its state, and
-    derivatives of a number that depends on all of it, must agree.
+    A disc with muscles that hits the ground, and one so wide that the kernels treat it as they do large bodies, take a
+    few substeps with them and with the eager backend. States, and derivatives of a number that depends on all of them,
+    must agree.
     """
     if device.type == "cuda" and (reason := unavailable(device)) is not None:
         return reason
     body = Body(2000, VonMises(*lame(young=1e3, poisson=0.3), 20.0), mass=4e-3, volume=1.6e-5, muscle=True)
     ground = VelocityRule("-y", j=(None, 5))
-    solver = Solver(Grid(64), (body,), (0.0, -9.8), rules=(ground,), backend="eager")
-    options = {"dtype": dtype, "device": device}
+    solver = Solver(Grid(128), (body,), (0.0, -9.8), rules=(ground,), backend="eager")
+    like = torch.empty(0, dtype=dtype, device=device)
     found = []
     try:
         with torch.inference_mode(False), torch.enable_grad():
-            points, origin = disc(sobol(2000, seed=0), centre=(0.5, 0.14), radius=0.1), torch.zeros(1, 2, **options)
+            points = torch.as_tensor(disc(sobol(2000, seed=0), centre=(0.0, 0.14), radius=0.1)).to(like)
+            points = torch.stack((points, points * like.new_tensor((4.0, 1.0)))) + like.new_tensor((0.5, 0.0))
+            waves = 30.0 * torch.arange(4 * 128**2, device=device).to(like).sin().view(2, 2, 128, 128)
             for step in (partial(solver.kernels.step, gravity=solver.gravity), solver.step):
-                x = torch.tensor(points, **options).requires_grad_()
-                field = (30.0 * torch.arange(2 * 64**2, **options).sin()).view(1, 2, 64, 64).requires_grad_()
-                start = replace(ParticleState.at_rest(x), v=torch.full_like(x, -1.0)[None])
-                end = step(start, field, origin=origin, substeps=5)
+                x, field = (t.clone().requires_grad_() for t in (points, waves))
+                start = replace(ParticleState.at_rest(x), v=torch.full_like(x, -1.0))
+                end = step(start, field, origin=like.new_zeros(2, 2), substeps=5)
                 loss = end.x.square().sum() + end.v.square().sum() + end.F.square().sum()
                 found.append((end.x, end.v, end.F, *torch.autograd.grad(loss, (x, field))))
     except (ValueError, RuntimeError) as error:  # they cannot be compiled, or not launched

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from cuda_imitation import THREADS, Gpu
 
 from torchmpm.native import kernels
+from torchmpm.native.cuda import plan
 from torchmpm.native.cuda.arguments import Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Driver, Launch
 from torchmpm.native.cuda.launcher import Launcher
@@ -46,11 +48,21 @@ class Recorder:
         self.launches.append(Recorded(function, launch, Arguments.from_buffer_copy(arguments), device))
 
 
+class Imitation(Gpu):
+    """The imitation of a GPU, with few libraries: one serves all materials and all numbers of particles."""
+
+    def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, bool]:
+        return super().load(kernel._replace(kinds=7, per_thread=max(kernel.per_thread, plan.PER_THREAD)), device)
+
+
 @contextmanager
 def in_use(driver: Driver) -> Iterator[Any]:
     """Meanwhile, the native backend runs kernels of this driver on tensors of the CPU."""
     launcher = Launcher(driver)
     with pytest.MonkeyPatch.context() as patch:
+        if isinstance(driver, Imitation):
+            patch.setattr(plan, "SHARED_THREADS", THREADS)
+            patch.setattr(plan, "TEAM_THREADS", THREADS)
         patch.setattr(kernels, "forward", launcher.forward)
         patch.setattr(kernels, "backward", launcher.backward)
         yield driver

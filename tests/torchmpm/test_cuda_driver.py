@@ -50,7 +50,7 @@ def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
     assert first.kernel.shared and not first.launch.cooperative
     assert (first.launch.blocks, first.launch.threads) == (64, 512)
     assert USUAL_SHARED_BYTES < first.launch.shared_bytes <= H100.shared_bytes
-    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1)
+    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1, 1)
     assert first.kernel.threads * first.kernel.per_thread >= 2000
     assert not second.kernel.shared and second.launch.cooperative
     assert second.arguments.rows == second.arguments.columns == Grid(128).width
@@ -260,6 +260,64 @@ def test_what_is_missing(
     monkeypatch.setattr(importlib.metadata, "version", version)
     found = compiler.missing(cuda)
     assert found is None if reason is None else reason in str(found)
+
+
+KERNEL = Kernel(False, True, "float", 512, 4, 2, True)
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, str]]:
+    """What NVRTC was asked for: architectures, and the precision."""
+    asked: list[tuple[str, str]] = []
+
+    def compile_source(text: str, arch: str, macros: dict[str, str]) -> bytes:
+        asked.append((arch, macros["TORCHMPM_REAL"]))
+        return f"binary {len(asked)}".encode()
+
+    monkeypatch.setattr(compiler, "compile_source", compile_source)
+    monkeypatch.setattr(compiler, "_versions", lambda: (1, 13, 0))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return asked
+
+
+def test_a_kernel_is_compiled_once(
+    compiled: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """For each architecture, each variant, each version of the compiler and each state of the sources."""
+    for _ in range(2):
+        assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 1"
+        assert compiler.compile_kernel(KERNEL, "sm_80") == b"binary 2"
+        assert compiler.compile_kernel(KERNEL._replace(real="double"), "sm_90") == b"binary 3"
+    monkeypatch.setattr(compiler, "_versions", lambda: (1, 13, 1))
+    assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 4"
+    monkeypatch.setattr(compiler, "digest_of_sources", lambda: "others")
+    assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 5"
+    assert len(list((tmp_path / "torchmpm").glob("torchmpm_forward-sm_*.cubin"))) == 5
+    assert len(list((tmp_path / "torchmpm").iterdir())) == 5
+
+
+def test_a_folder_that_cannot_be_written(compiled: list[tuple[str, str]], tmp_path: Path) -> None:
+    (tmp_path / "torchmpm").write_text("a file where the folder should be")
+    assert [compiler.compile_kernel(KERNEL, "sm_90") for _ in range(2)] == [b"binary 1", b"binary 2"]
+
+
+needs_nvrtc = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
+
+
+@needs_nvrtc
+def test_an_error_of_the_compiler_is_shown() -> None:
+    with pytest.raises(ValueError, match=r"(?s)cannot be compiled for sm_90: .*broken"):
+        compiler.compile_source("broken", "sm_90", {})
+
+
+@needs_nvrtc
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_kernels_compile(adjoint: bool, shared: bool) -> None:
+    """For the oldest card; `make cuda-kernels` compiles all for all."""
+    kernel = Kernel(adjoint, shared, "float", 256, 2, 7, True)
+    assert compiler.compile_source(compiler.source_of(kernel), "sm_80", kernel.macros).startswith(b"\x7fELF")
 
 
 def test_an_old_card(monkeypatch: pytest.MonkeyPatch) -> None:

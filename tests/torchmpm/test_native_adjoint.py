@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import lively, normal, robot
+from scenes import combination, lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, trajectory
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
 
@@ -69,10 +69,8 @@ def varied(count: int, given: Leaves) -> Solver:
 
 
 def loss(final: ParticleState) -> Tensor:
-    """A random combination of everything, brought to one size."""
-    sizes = {"x": 1.0, "v": 0.2, "C": 0.01, "F": 1.0, "Jp": 1.0}
-    fields = enumerate((getattr(final, name), size) for name, size in sizes.items())
-    return sum(size * (normal(*t.shape, seed=20 + k).to(t) * t).sum() for k, (t, size) in fields)
+    """A random combination of everything."""
+    return combination(final, 20, x=1.0, v=0.2, C=0.01, F=1.0, Jp=1.0)
 
 
 def gradients(
@@ -185,26 +183,6 @@ def test_threads_and_batch_make_no_difference() -> None:
         torch.set_num_threads(before)
     for result in results[1:]:
         assert all(torch.equal(result[name], results[0][name]) for name in wanted)
-
-
-def test_checkpoints_of_a_trajectory() -> None:
-    """Steps nest in torchmpm.trajectory like those of the plain substep."""
-    state = lively(30)
-    fields = [(60.0 * normal(1, 2, 16, 16, seed=k)).requires_grad_() for k in range(3)]
-    results = []
-    for backend, checkpointed in (("eager", False), ("native", False), ("native", True)):
-        solver = robot(30, backend=backend)
-        final, _ = trajectory(
-            lambda s, a, solver=solver: solver.step(s, a, substeps=4),
-            state,
-            fields,
-            observe=lambda s: None,
-            checkpointed=checkpointed,
-        )
-        results.append(torch.autograd.grad(loss(final), fields))
-    for result in results[1:]:
-        for one, other in zip(result, results[0], strict=True):
-            torch.testing.assert_close(one, other, rtol=0, atol=1e-12 * other.abs().max().item())
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:

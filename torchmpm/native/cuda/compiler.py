@@ -96,20 +96,16 @@ def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.Stri
 
 def _key(kernel: Kernel, arch: str) -> str:
     """Hash of everything that a binary depends on."""
-    digest = hashlib.sha256(f"{kernel} {arch} {sorted(_ROUNDING.items())} {_versions()}".encode())
-    digest.update(_sources())
-    return digest.hexdigest()[:24]
+    facts = f"{kernel} {arch} {sorted(_ROUNDING.items())} {_versions()} {digest_of_sources()}"
+    return hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 
-@functools.cache
-def _sources() -> bytes:
-    """Hash of all sources."""
-    digest = hashlib.sha256()
-    for file in sorted(
-        file for folder in FOLDERS for file in folder.iterdir() if file.suffix in (".cu", ".cuh", ".hpp")
-    ):
+def digest_of_sources() -> str:
+    """Hash of everything that the kernels are compiled from."""
+    digest, files = hashlib.sha256(), (file for folder in FOLDERS for file in folder.iterdir())
+    for file in sorted(file for file in files if file.suffix in (".cu", ".cuh", ".hpp")):
         digest.update(file.name.encode() + file.read_bytes())
-    return digest.digest()
+    return digest.hexdigest()
 
 
 @functools.cache

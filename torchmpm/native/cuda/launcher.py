@@ -52,6 +52,7 @@ class Launcher:
             substeps=substeps,
             resolution=tables.resolution,
             bodies=tables.num_bodies,
+            rules=tables.num_rules,
             kinds=kinds_of(bodies),
             muscles=inputs.field is not None and any(body.muscle for body in bodies),
         )

@@ -25,6 +25,7 @@ class Call(NamedTuple):
     substeps: int
     resolution: int
     bodies: int
+    rules: int
     kinds: int  # see arguments.kinds_of
     muscles: bool  # a field acts on a body
 
@@ -70,7 +71,7 @@ def shared_pass(call: Call, card: Card, resident: Resident) -> Pass | None:
         return None
     kernel = _kernel(call, shared=True, threads=SHARED_THREADS, per_thread=per_thread)
     for side in range(min(call.width, LARGEST_WINDOW), min(call.width, SMALLEST_WINDOW) - 1, -1):
-        size = kernel.shared_bytes(side, side, 1)
+        size = kernel.shared_bytes(side, side, call.bodies, call.rules)
         if size <= card.shared_bytes:
             scratch = kernel.scratch_bytes(side, side, call.resolution, call.particles, call.substeps)
             teams = min(call.batch, _at_least_one(kernel, resident(kernel, size)))
@@ -88,7 +89,7 @@ def team_pass(call: Call, card: Card, resident: Resident) -> Pass:
     while True:
         team = -(-call.particles // (TEAM_THREADS * per_thread))
         kernel = _kernel(call, shared=False, threads=TEAM_THREADS, per_thread=per_thread)
-        size = kernel.shared_bytes(call.width, call.width, call.bodies)
+        size = kernel.shared_bytes(call.width, call.width, call.bodies, call.rules)
         blocks = _at_least_one(kernel, resident(kernel, size))
         if team <= blocks:
             break
