@@ -1,8 +1,8 @@
 // The forward kernel: advances robots by a step, each from its components to the result.
 #include "step.cuh"
 
-// The particles of a thread. Registers keep what a substep needs of the one before; v and C only pass through, so those of a
-// particle that leaves the domain go to the result at once.
+// The particles of a thread. Registers keep what a substep needs of the one before; v and C only pass through, so those
+// of a particle that leaves the domain go to the result at once.
 class Registers {
 public:
     INLINE explicit Registers(const Robot& robot) : robot(robot) {}
@@ -10,7 +10,8 @@ public:
     INLINE void load() {
         for_own([&](int k, int index) {
             const Real* from = robot.given.components;
-            own[k] = {from[at(X, index)], from[at(Y, index)], read_matrix(F0, index), SNOW ? from[at(JP, index)] : Real(1)};
+            own[k] = {from[at(X, index)], from[at(Y, index)], read_matrix(F0, index),
+                      SNOW ? from[at(JP, index)] : Real(1)};
             body[k] = robot.given.num_bodies > 1 ? robot.body_of(index) : 0;
         });
     }

@@ -39,7 +39,7 @@ enum Atomic : int {
 #include "cuda_imitation.hpp"
 #else
 
-#define KERNEL extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS)
+#define KERNEL extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS, 1)
 #define GRID_CONSTANT __grid_constant__
 #define THREAD int(threadIdx.x)
 #define BLOCK int(blockIdx.x)
@@ -65,7 +65,11 @@ template <class Number> INLINE void mark(Number* at) { *at = 1; }
 INLINE void fence() { __threadfence(); }
 
 // The nearest integer.
-INLINE void round_to(Real value, int32_t& to) { to = sizeof(Real) == 4 ? __float2int_rn(float(value)) : __double2int_rn(value); }
-INLINE void round_to(Real value, int64_t& to) { to = sizeof(Real) == 4 ? __float2ll_rn(float(value)) : __double2ll_rn(value); }
+INLINE void round_to(Real value, int32_t& to) {
+    to = sizeof(Real) == 4 ? __float2int_rn(float(value)) : __double2int_rn(value);
+}
+INLINE void round_to(Real value, int64_t& to) {
+    to = sizeof(Real) == 4 ? __float2ll_rn(float(value)) : __double2ll_rn(value);
+}
 
 #endif

@@ -37,7 +37,8 @@ struct TeamMemory {
     int summary[3][SUMMARY];
 };
 
-// Nodes around a robot: all of the padded grid in global memory, or a window of it in shared memory that follows the robot.
+// Nodes around a robot: all of the padded grid in global memory, or a window of it in shared memory that follows the
+// robot.
 struct Window {
     int rows, columns;
     int i, j;  // its first node on the padded grid
@@ -61,8 +62,8 @@ INLINE int follow(int first, int size, int low, int high, int width) {
     return middle < 0 ? 0 : middle < last ? middle : last;
 }
 
-// What particles add up on a node, in fixed point. Side by side, so that all sums of a row of nodes have addresses at fixed
-// distances.
+// What particles add up on a node, in fixed point. Side by side, so that all sums of a row of nodes have addresses at
+// fixed distances.
 struct Sums {
     Fixed mass, x, y;
 #if !TORCHMPM_SHARED
@@ -117,7 +118,7 @@ public:
     BlockRule* rules;
     uint32_t* codes;  // rules of each node of the padded grid
     Nodes nodes;
-    Window window;    // of the sums that are being added up
+    Window window;  // of the sums that are being added up
     Domain domain;
     Real dt, h, damping, mass_epsilon;
     Real gain[2];  // velocity from gravity in a substep
@@ -157,7 +158,7 @@ public:
     INLINE void prepare(int64_t which) {
         element = which;
         domain = {given.origin[2 * element], given.origin[2 * element + 1], Real(1 / given.h), Real(given.margin),
-                  Real(given.extent), int(given.resolution)};
+                  Real(given.extent),        int(given.resolution)};
         for (int axis = 0; axis < 2; ++axis) gain[axis] = dt * given.gravity[2 * element + axis];
         window.i = window.j = 0;
         for (int substep = -2; substep < 1; ++substep) team.clear(substep);
@@ -231,7 +232,7 @@ private:
     }
 
     // Ends of ranges may be infinite, and far away.
-    INLINE static int whole(double end) { return int(end < -(1 << 28) ? -(1 << 28) : end > (1 << 28) ? 1 << 28 : end); }
+    INLINE static int whole(double end) { return int(end<-(1 << 28) ? -(1 << 28) : end>(1 << 28) ? 1 << 28 : end); }
 
     INLINE static BlockRule rule(const RuleTable& table) {
         BlockRule rule;

@@ -9,10 +9,12 @@ struct NoTape {
     INLINE void note(int, const Robot&) const {}
 };
 
-// `particles.each(substep, f)` calls f(particle, index, body) for each particle of a thread; f returns whether the particle
-// leaves the domain with this substep, or is outside from the beginning: it will not take part again, as the domain does not
-// move during a step. Returns why the robot must be given up; all threads of the team call this together.
-template <class Particles, class Tape> INLINE int advance(Robot& robot, Substep& substep, Particles& particles, const Tape& tape) {
+// `particles.each(substep, f)` calls f(particle, index, body) for each particle of a thread; f returns whether the
+// particle leaves the domain with this substep, or is outside from the beginning: it will not take part again, as the
+// domain does not move during a step. Returns why the robot must be given up; all threads of the team call this
+// together.
+template <class Particles, class Tape>
+INLINE int advance(Robot& robot, Substep& substep, Particles& particles, const Tape& tape) {
     const Team& team = robot.team;
     const int substeps = int(robot.given.substeps);
     // Before the first substep, find where the particles are, then the heaviest node and the fastest particle.

@@ -98,8 +98,8 @@ public:
         return sum;
     }
 
-    // P2G: deform, and give mass and momentum to the nodes; returns whether the particle takes part. `survey` gets where it
-    // is and how fast; `keep` is false for a trial without effect on the particle.
+    // P2G: deform, and give mass and momentum to the nodes; returns whether the particle takes part. `survey` gets
+    // where it is and how fast; `keep` is false for a trial without effect on the particle.
     INLINE bool give(Particle& p, int index, int body_index, bool keep, Survey& survey) const {
         const Place at = locate(p);
         if (!at.on) return false;
@@ -205,7 +205,8 @@ private:
             constrain(robot.rules, robot.codes[i * robot.width() + j], v);
         }
         robot.nodes.velocity[node] = {v[0], v[1]};
-        if (record) tape.x[node] = momentum[0] * inverse, tape.y[node] = momentum[1] * inverse, tape.inverse[node] = inverse;
+        if (record)
+            tape.x[node] = momentum[0] * inverse, tape.y[node] = momentum[1] * inverse, tape.inverse[node] = inverse;
     }
 
     INLINE static Real not_a_number() { return Real(__builtin_bit_cast(float, 0x7fffffff)); }
