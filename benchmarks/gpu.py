@@ -682,7 +682,8 @@ def short(value: Any) -> str:
 
 def follow(command: list[str], stage: str, seconds: float, report: Report) -> int | None:
     """Run the process of a stage and report its rows; returns the check to go on with where the process broke off."""
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+    options: dict[str, Any] = {"text": True, "errors": "replace", "start_new_session": True}
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options)
     lines: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
@@ -704,7 +705,7 @@ def follow(command: list[str], stage: str, seconds: float, report: Report) -> in
                 said.append(line)
         code = child.wait()
     except queue.Empty:
-        child.kill()
+        os.killpg(child.pid, signal.SIGKILL)  # and the processes that it started
         code = child.wait()
         said = ["out of time"]
     if code == 0:

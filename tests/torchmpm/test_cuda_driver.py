@@ -148,8 +148,8 @@ def test_arguments_are_those_of_the_call() -> None:
             super().launch(function, launch, arguments, device)
             bodies = (BodyTable * arguments.num_bodies).from_address(arguments.bodies)
             rules = (RuleTable * arguments.num_rules).from_address(arguments.rules)
-            counters = ctypes.c_int32 * (launch.blocks // arguments.team * COUNTERS)
-            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters))))
+            counters = ctypes.c_int32 * (launch.cooperative * launch.blocks // arguments.team * COUNTERS)
+            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters or 1))))
 
     with in_use(Reader()) as driver, torch.no_grad():
         solver.step(state, field, substeps=7, origin=origin)
@@ -323,7 +323,9 @@ def test_kernels_compile(adjoint: bool, shared: bool) -> None:
 def test_an_old_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiler, "missing", lambda cuda: None)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    compiler.unavailable.cache_clear()
     reason = compiler.unavailable(torch.device("cuda", 0))
+    compiler.unavailable.cache_clear()
     assert reason == "on CUDA it needs a card of compute capability 8.0 or newer, cuda:0 has 7.5"
 
 
