@@ -56,6 +56,7 @@ template <Atomic name> uint32_t count(uint32_t* counter) {
     return imitation::update(name, counter, [](uint32_t old) { return old + 1; });
 }
 template <class Number> Number look(Number* at) { return imitation::look(at); }
+template <class Number> void mark(Number* at) { imitation::mark(at); }
 inline void fence() {}
 inline int largest_of_warp(int value) { return value; }
 

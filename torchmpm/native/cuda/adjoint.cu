@@ -86,7 +86,7 @@ public:
             robot.window = window;
             if (moves) robot.read_field();
             reverse.nodes(tape.box(s - 1), tape.record(s - 1));
-            robot.team.wait<MOVED>();
+            robot.team.wait<RETURNED>();
         }
         reverse.flush_field();
         store_sums();
@@ -136,7 +136,7 @@ private:
             add<ADD_SHARE>(&shares[axis][THREAD % SHARES], reverse.origin_bar[axis]);
             add<ADD_SHARE>(&shares[2 + axis][THREAD % SHARES], reverse.gain_bar[axis] * robot.dt);
         }
-        BARRIER(SUMMED);
+        BARRIER(SHARED_OUT);
         if (THREAD >= 4) return;
         Real sum = 0;
         for (int k = 0; k < SHARES; ++k) sum += shares[THREAD][k];

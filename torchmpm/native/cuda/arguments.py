@@ -24,9 +24,9 @@ COUNTERS = 64
 #: Components of a particle's state.
 COMPONENTS = 13
 #: Threads share the work of a sum in so many parts.
-SHARES = 32
+SHARES = 16
 #: Numbers of a summary of a substep.
-SUMMARY = 7
+SUMMARY = 8
 
 
 def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:

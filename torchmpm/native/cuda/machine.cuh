@@ -1,17 +1,21 @@
 // What the kernels ask of the machine. Tests define TORCHMPM_IMITATION and bring their own: each thread of a block as a
-// fibre of one CPU thread. Barriers and atomic operations have names, so that tests can take one away.
+// fibre of one CPU thread. Barriers and atomic operations have names, so that tests can take any one of them away.
 #pragma once
 
+// Each is passed by all threads of a block.
 enum Barrier : int {
-    FREE,       // the last robot's memory is not in use any more
-    PREPARED,   // tables are ready and sums are zero
-    SURVEYED,   // all particles have been located
-    PLACED,     // the field's part in the window has been read
-    GIVEN,      // P2G: all particles have given mass and momentum to the nodes
-    MOVED,      // all nodes have their velocities
-    ASSEMBLED,  // the blocks of a team have waited for each other
-    REVERSED,   // adjoint: all particles have passed on their derivatives
-    SUMMED,     // adjoint: the threads' shares of a sum are there
+    FREE,        // the last robot's memory is not in use any more
+    PREPARED,    // tables are ready, and sums are zero
+    SURVEYED,    // all particles have been located
+    PLACED,      // the actuation of the nodes in the window has been read
+    GIVEN,       // P2G: all particles have given mass and momentum to the nodes
+    MOVED,       // all nodes have their velocities
+    FOLLOWED,    // the window has moved, and the actuation in it has been read again
+    JOINED,      // the blocks of a team have waited for each other
+    SUMMARISED,  // and the summary is that of all of them
+    REVERSED,    // adjoint: all particles have passed on their derivatives
+    RETURNED,    // adjoint: all nodes have passed on theirs
+    SHARED_OUT,  // adjoint: the threads' shares of a sum are there
     BARRIERS
 };
 
@@ -19,16 +23,15 @@ enum Atomic : int {
     ADD_MASS,
     ADD_MOMENTUM_X,
     ADD_MOMENTUM_Y,
-    SPOIL_NODE,
-    SUMMARISE,        // threads of a block
-    SUMMARISE_TEAM,   // blocks of a team
+    SUMMARISE,       // threads of a block
+    SUMMARISE_TEAM,  // blocks of a team
     ARRIVE,
     ADD_VELOCITY_BAR_X,
     ADD_VELOCITY_BAR_Y,
     ADD_FIELD_BAR_X,
     ADD_FIELD_BAR_Y,
-    ADD_SHARE,        // threads of a block
-    ADD_SUM,          // blocks of a team
+    ADD_SHARE,  // threads of a block
+    ADD_SUM,    // blocks of a team
     ATOMICS
 };
 
@@ -56,7 +59,9 @@ template <Atomic> INLINE void add(int64_t* to, int64_t value) {
 template <Atomic> INLINE void add(Real* to, Real value) { atomicAdd(to, value); }
 template <Atomic> INLINE void raise(int* to, int value) { atomicMax(to, value); }
 template <Atomic> INLINE uint32_t count(uint32_t* counter) { return atomicAdd(counter, 1u); }
-INLINE uint32_t look(uint32_t* counter) { return *static_cast<volatile uint32_t*>(counter); }
+// Numbers that other threads may be writing.
+template <class Number> INLINE Number look(Number* at) { return *static_cast<volatile Number*>(at); }
+template <class Number> INLINE void mark(Number* at) { *at = 1; }
 // Orders what a thread wrote before an atomic operation with what others read after they saw it.
 INLINE void fence() { __threadfence(); }
 

@@ -10,7 +10,7 @@ struct alignas(2 * sizeof(Real)) Pair {
     Real x, y;
 };
 
-constexpr int SHARES = 32;
+constexpr int SHARES = 16;
 
 // Whether a body has a material; decided by the compiler where all bodies have the same.
 template <Kind kind> INLINE bool has_kind(int other) {

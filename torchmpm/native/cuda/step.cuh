@@ -41,7 +41,7 @@ template <class Particles, class Tape> INLINE int advance(Robot& robot, Substep&
         substep.move_nodes<Tape::records>(s, tape.record(s));
         team.clear(s + 1);
         team.wait_and_summarise<MOVED>(s);
-        if (const int failure = team.of(s)[FAILURE]) return failure;
+        if (const int failure = team.of(s)[SPILL]) return failure;
         substep.before = robot.window;
         if (s + 1 == substeps) break;
         const int* summary = team.of(s);
@@ -49,7 +49,7 @@ template <class Particles, class Tape> INLINE int advance(Robot& robot, Substep&
         robot.follow(s);
         if (TORCHMPM_MUSCLES && robot.window != substep.before) {
             robot.read_field();
-            team.wait<PLACED>();
+            team.wait<FOLLOWED>();
         }
     }
     return NONE;

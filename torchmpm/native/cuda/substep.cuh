@@ -30,7 +30,7 @@ struct Survey {
     }
     INLINE void join_masses(const Team& team, int substep) const {
         team.include(substep, HEAVIEST, heaviest);
-        team.include(substep, FAILURE, failure);
+        team.include(substep, SPILL, failure);
     }
 
 private:
@@ -152,7 +152,7 @@ private:
         if (TORCHMPM_SHARED) return survey.fail(LEFT_RANGE);
         const int first = robot.window.at(at.i, at.j);
         three([&](int p) {
-            three([&](int q) { add<SPOIL_NODE>(robot.nodes.spoilt + first + p * robot.window.columns + q, Fixed(1)); });
+            three([&](int q) { mark(robot.nodes.spoilt + first + p * robot.window.columns + q); });
         });
     }
 

@@ -12,6 +12,7 @@ enum Summary : int {
     FASTEST,   // rank of the largest speed, see fixed.cuh
     HEAVIEST,  // rank of the largest mass, of a particle before the first substep and then of a node
     FAILURE,   // 0, or why the robot is given up
+    SPILL,     // the same of the nodes, which begin while particles' failures are still being read
     SUMMARY
 };
 enum Failure : int { NONE, LEFT_WINDOW, LEFT_RANGE };
@@ -47,7 +48,7 @@ struct Team {
         BARRIER(barrier);
         if (blocks == 1) return;
         if (THREAD == 0) meet();
-        BARRIER(ASSEMBLED);
+        BARRIER(JOINED);
     }
 
     // Also makes the summary of a substep that of all blocks.
@@ -58,9 +59,9 @@ struct Team {
             int* total = all[(substep + 3) % 3];
             for (int k = 0; k < SUMMARY; ++k) raise<SUMMARISE_TEAM>(total + k, of(substep)[k]);
             meet();
-            for (int k = 0; k < SUMMARY; ++k) of(substep)[k] = total[k];
+            for (int k = 0; k < SUMMARY; ++k) of(substep)[k] = look(total + k);
         }
-        BARRIER(ASSEMBLED);
+        BARRIER(SUMMARISED);
     }
 
 private:
