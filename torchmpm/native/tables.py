@@ -84,13 +84,13 @@ class Inputs(NamedTuple):
 
         The last has the shape (8, B, N), a column for each particle. Those that are not wanted are empty.
         """
-        nothing = self.components.new_empty(0)
+        components, field = self.components, self.field
         return (
-            torch.empty_like(self.components),
-            torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
+            torch.empty_like(components),
+            components.new_empty(field.shape if wants_field and field is not None else 0),
             torch.empty_like(self.origin),
             torch.empty_like(self.gravity),
-            self.components.new_empty(VALUES, *self.components.shape[1:]) if wants_values else nothing,
+            components.new_empty((VALUES, *components.shape[1:]) if wants_values else 0),
         )
 
 
