@@ -724,7 +724,7 @@ def run_all(args: argparse.Namespace, report: Report, scratch: Path) -> None:
         references = subprocess.Popen([*command, "--stage", "references"], stdout=log, stderr=subprocess.STDOUT)
     try:
         for stage in args.stages:
-            stage_end, first = min(end, time.monotonic() + LIMITS[stage]), 0
+            stage_end, first = min(end, time.monotonic() + LIMITS[stage] * args.seconds / 480), 0
             while first is not None and (left := stage_end - time.monotonic()) > 5:
                 if references.poll():
                     (scratch / "no-references").touch()
