@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from torchmpm.native.cuda.arguments import COMPONENTS, COUNTERS, Arguments, Kernel
-from torchmpm.native.cuda.compiler import FOLDERS
+from torchmpm.native.cuda.compiler import FOLDERS, digest_of_sources
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.cuda.launcher import Launcher
 from torchmpm.native.cuda.plan import Call, Pass
@@ -21,6 +21,8 @@ from torchmpm.native.library import build, cache_folder
 from torchmpm.native.tables import BodyTable, RuleTable
 
 HERE = Path(__file__).with_name("imitation")
+#: Threads of a block, and particles that each of them keeps.
+THREADS, PER_THREAD = 32, 4
 
 
 class Broken(Exception):
@@ -76,10 +78,9 @@ def library(shared: bool, real: str, threads: int, per_thread: int, kinds: int, 
 
 def options(macros: dict[str, str]) -> list[str]:
     """What the compiler needs; changes with the sources."""
+    own = b"".join(file.read_bytes() for file in sorted(HERE.iterdir()))
+    named = macros | {"DIGEST": hashlib.sha256(digest_of_sources().encode() + own).hexdigest()[:16]}
     folders = (*FOLDERS, HERE)
-    sources = sorted(file for folder in folders for file in folder.iterdir() if file.suffix in (".cu", ".cuh", ".hpp"))
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in sources)).hexdigest()[:16]
-    named = macros | {"DIGEST": digest}
     return [*(f"-D{name}={value}" for name, value in named.items()), *(f"-I{folder}" for folder in folders)]
 
 
@@ -153,8 +154,7 @@ class Plan:
     teams: int = 2  # robots at a time
     window: tuple[int, int] = (10**6, 10**6)  # nodes in shared memory, at most
     muscles: bool = True  # kernels for muscles, also where no body has any
-    threads: int = 32  # of a block
-    per_thread: int = 2  # particles that each of them keeps
+    sizes: tuple[int, int] = (THREADS, PER_THREAD)
 
 
 class Imitation(Launcher):
@@ -169,11 +169,9 @@ class Imitation(Launcher):
         for shared, team in ((True, 1), (False, plan.team)):
             if not (plan.shared if shared else team):
                 continue
-            kernel = Kernel(
-                call.adjoint, shared, call.real, plan.threads, plan.per_thread, kinds=7, muscles=plan.muscles
-            )
+            kernel = Kernel(call.adjoint, shared, call.real, *plan.sizes, kinds=7, muscles=plan.muscles)
             rows, columns = (min(n, call.width) if shared else call.width for n in plan.window)
-            shared_bytes = kernel.shared_bytes(rows, columns, call.bodies, 16)
+            shared_bytes = kernel.shared_bytes(rows, columns, call.bodies, call.rules)
             scratch_bytes = kernel.scratch_bytes(rows, columns, call.resolution, call.particles, call.substeps)
             one = Pass(kernel, rows, columns, team, plan.teams, shared_bytes, scratch_bytes)
             passes.append((one, self.driver.load(kernel, device)))

@@ -14,16 +14,10 @@ import torch
 from cuda_imitation import Broken, Gpu, Imitation, Plan, Threads
 from native_scenes import NAMES, moving, solvers
 from scenes import assert_close, assert_identical, lively, normal, robot
-from test_native_adjoint import (
-    Leaves,
-    assert_gradients_close,
-    gradients,
-    state_leaves,
-    value_leaves,
-    varied,
-)
+from test_native_adjoint import assert_gradients_close, gradients, state_leaves, value_leaves, varied
+from torch import Tensor
 
-from torchmpm import Body, Grid, ParticleState, Snow, Solver
+from torchmpm import Grid, ParticleState, Solver
 from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
 from torchmpm.native.cuda.compiler import FOLDERS
@@ -253,12 +247,13 @@ BARRIERS, ATOMICS = (
     re.findall(r"^    ([A-Z_]+)[,\n]", enum, re.MULTILINE)[:-1]
     for enum in re.findall(r"^enum [^{]*{(.*?)^};", (FOLDERS[0] / "machine.cuh").read_text(), re.DOTALL | re.MULTILINE)
 )
+Ends = list[list[Tensor]]
 #: Robots whose blocks pass every barrier and use every atomic operation: a window that must move, a team of blocks,
 #: robots that are given up.
 SCENES = (Plan(window=(14, 12), teams=1), Plan(shared=False, team=2, teams=1), Plan(window=(6, 6), teams=1, team=1))
 
 
-def outcomes(gpu: Gpu, use: Callable[..., None]) -> Iterator[list[torch.Tensor]]:
+def outcomes(gpu: Gpu, use: Callable[..., None]) -> Iterator[list[Tensor]]:
     """States and derivatives in all scenes; an empty list where a launch did not end well."""
     solver = robot(40, grid=Grid(24), rules=robot(1).rules)
     given = {key: value for key, value in state_leaves(40, 2).items() if key not in ("actuation", "origin")}
@@ -275,7 +270,7 @@ def outcomes(gpu: Gpu, use: Callable[..., None]) -> Iterator[list[torch.Tensor]]
             yield []
 
 
-def same(first: list[torch.Tensor], second: list[torch.Tensor]) -> bool:
+def same(first: list[Tensor], second: list[Tensor]) -> bool:
     """Whether states are the same bit for bit, and derivatives but for rounding."""
     if not first or not second or not torch.equal(first[0], second[0]):
         return False
@@ -283,17 +278,17 @@ def same(first: list[torch.Tensor], second: list[torch.Tensor]) -> bool:
 
 
 @pytest.fixture(scope="module")
-def intact() -> list[list[torch.Tensor]]:
+def intact() -> Ends:
     with pytest.MonkeyPatch.context() as patch:
         return list(outcomes(Gpu(), use.__wrapped__(patch)))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_is_missing(seed: int, intact: list[list[torch.Tensor]], use: Callable[..., None]) -> None:
+def test_nothing_is_missing(seed: int, intact: Ends, use: Callable[..., None]) -> None:
     assert all(map(same, outcomes(Gpu(seed), use), intact))
 
 
-def noticed(gpu: Gpu, intact: list[list[torch.Tensor]], use: Callable[..., None]) -> bool:
+def noticed(gpu: Gpu, intact: Ends, use: Callable[..., None]) -> bool:
     """Whether numbers differ, or the kernels fail; in a process of its own, as they may write anywhere."""
     child = os.fork()
     if child == 0:
@@ -306,30 +301,26 @@ def noticed(gpu: Gpu, intact: list[list[torch.Tensor]], use: Callable[..., None]
 
 
 @pytest.mark.parametrize("name", BARRIERS)
-def test_every_barrier_is_needed(name: str, intact: list[list[torch.Tensor]], use: Callable[..., None]) -> None:
+def test_every_barrier_is_needed(name: str, intact: Ends, use: Callable[..., None]) -> None:
     """Without it, some order of threads gives other numbers, or threads wait for ever."""
     index = BARRIERS.index(name)
     assert any(noticed(Gpu(seed, missing_barrier=index), intact, use) for seed in range(5))
 
 
 @pytest.mark.parametrize("name", ATOMICS)
-def test_every_atomic_operation_is_needed(
-    name: str, intact: list[list[torch.Tensor]], use: Callable[..., None]
-) -> None:
+def test_every_atomic_operation_is_needed(name: str, intact: Ends, use: Callable[..., None]) -> None:
     """As a load and a store, between which other threads run, it loses what they add."""
     index = ATOMICS.index(name)
     assert any(noticed(Gpu(seed, plain_atomic=index), intact, use) for seed in range(5))
 
 
-def test_nothing_is_noticed_where_nothing_is_missing(
-    intact: list[list[torch.Tensor]], use: Callable[..., None]
-) -> None:
+def test_nothing_is_noticed_where_nothing_is_missing(intact: Ends, use: Callable[..., None]) -> None:
     assert not noticed(Gpu(seed=9), intact, use)
 
 
 @pytest.mark.parametrize("plan", [Plan(window=(14, 14)), Plan(shared=False, team=2, teams=1)], ids=["shared", "team"])
 def test_thread_sanitizer_finds_no_race(plan: Plan, use: Callable[..., None]) -> None:
     """With real threads: two bodies, muscles, rules, robots that are given up or leave the window; both kernels."""
-    use(replace(plan, threads=8, per_thread=4), Threads())
+    use(replace(plan, sizes=(8, 4)), Threads())
     given = {key: value.float() for key, value in state_leaves(30, 2).items()}
     gradients(lambda _: solvers(30, 2)["three bodies"], given, ("x", "actuation"), 3, "native")

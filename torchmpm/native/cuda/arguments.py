@@ -110,7 +110,7 @@ class Kernel(NamedTuple):
         return sum(map(_aligned, pieces)) + (rows * columns * self.node_bytes if self.shared else 0)
 
     def scratch_bytes(self, rows: int, columns: int, resolution: int, particles: int, substeps: int) -> int:
-        """Global memory of a team; with nodes in global memory, ``rows`` and ``columns`` are those of the whole grid."""
+        """Global memory of a team. With nodes there, ``rows`` and ``columns`` are those of the whole grid."""
         nodes, real = rows * columns, self.real_bytes
         pieces = [4 * (resolution + 2 * PAD) ** 2]  # which rules hold on each node
         if not self.shared:

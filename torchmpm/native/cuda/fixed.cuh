@@ -22,9 +22,10 @@ using Fixed = FixedOf<WIDE>::type;
 // which takes the remaining bit.
 constexpr int RANGE = WIDE ? 62 : 30;
 // How much faster the fastest particle and heavier the heaviest node may become within a substep. What leaves the range in
-// shared memory starts again in global memory, where it is larger than anything that is not about to overflow needs.
-constexpr Real FASTER = TORCHMPM_SHARED ? Real(2) : sizeof(Real) == 8 ? Real(1 << 12) : Real(1 << 20);
-constexpr Real HEAVIER = TORCHMPM_SHARED ? Real(1.5) : Real(16);
+// shared memory starts again in global memory. There, what becomes faster than that counts as not finite: from rest, that is
+// more than a cell per substep.
+constexpr Real FASTER = TORCHMPM_SHARED ? Real(2) : sizeof(Real) == 8 ? Real(64) : Real(1 << 20);
+constexpr Real HEAVIER = TORCHMPM_SHARED ? Real(1.5) : sizeof(Real) == 8 ? Real(2) : Real(16);
 // As many particles as a node may have before anything is known about it.
 constexpr Real CROWD = WIDE ? Real(1 << 30) : Real(1 << 12);
 // The least range of speeds: so many cells per substep.
