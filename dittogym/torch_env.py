@@ -32,8 +32,6 @@ from torchmpm.rollout import Segment, check_repetition
 from torchmpm.tree import transforming
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-#: Substeps in a control step, far above any use.
-MOST_SUBSTEPS = 1_000_000
 RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
@@ -306,10 +304,9 @@ class TorchEnv:
                 "TorchEnv.step must not be called in a backward pass, as torch.utils.checkpoint does to repeat a step "
                 "from the state after it: use dittogym.core.step with its model, which keeps nothing"
             )
-        if not isinstance(soft, bool):
-            raise ValueError(f"soft must be True or False, got {soft!r}")
+        checks.flag("soft", soft)
         action = to_grid_layout(self._checked(action), self.action_layout)
-        result = core.step(self.model, self.env_state, action, soft=soft)
+        result = core.evaluate(self.model, *core.advance(self.model, self.env_state, action), soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
@@ -369,7 +366,7 @@ class TorchEnv:
             seed: Seed of the reset and, if it is not ``None``, of the policy's noise.
             index: Which element of the batch.
             options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
-                and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+                and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
 
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
@@ -398,12 +395,10 @@ def find_substeps(dt: float, substeps: int | None) -> int:
     """Substeps of ``dt`` s in a control step; ``None`` stands for as many as take :data:`CONTROL_STEP`."""
     checks.number("dt", dt, above=0.0)
     if substeps is not None:
-        return checks.whole("substeps", substeps, 1, MOST_SUBSTEPS)
-    ratio = CONTROL_STEP / dt
-    count = round(ratio) if ratio <= MOST_SUBSTEPS else 0
+        return checks.whole("substeps", substeps, 1)
+    count = round(CONTROL_STEP / dt)
     if not math.isclose(count * dt, CONTROL_STEP):
-        problem = f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}"
-        raise ValueError(f"{problem}; there may be at most {MOST_SUBSTEPS} substeps")
+        raise ValueError(f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}")
     return count
 
 
