@@ -88,11 +88,6 @@ def test_an_episode_repeats_bit_by_bit(task: str) -> None:
     assert_same_bits(episode(task), episode(task))
 
 
-def test_the_cpu_is_deterministic() -> None:
-    for backend in ("auto", "eager"):
-        assert tiny("run", deterministic=True, backend=backend).num_particles == 120
-
-
 def spoil(env: TorchEnv, how: str) -> None:
     """Make element 1 unable to go on."""
     state = env.state

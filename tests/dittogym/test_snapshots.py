@@ -182,43 +182,6 @@ def test_a_snapshot_fits_functions_with_the_same_arguments() -> None:
         scaled(2.0).load(scaled(3.0).save())
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"task": "grow"}, "task"),
-        ({"particles": 119}, "particles"),
-        ({"dtype": "float32"}, "dtype"),
-        ({"num_envs": 3}, "num_envs"),
-        ({"substeps": 3}, "substeps"),
-        ({"dt": 5e-5}, "dt"),
-        ({"obstacles": ()}, "obstacles"),
-        ({"body": np.ones((9, 5), bool)}, "robot"),
-    ],
-)
-@torch.no_grad()
-def test_a_snapshot_that_does_not_fit_is_refused(options: dict, name: str) -> None:
-    env, other = tiny("run", 2), tiny(**{"task": "run", "num_envs": 2, **options})
-    env.reset(seed=0)
-    other.reset(seed=0)
-    before = env.state
-    for mask in (None, [True, False]):
-        with pytest.raises(ValueError, match=f"snapshot must .*{name}"):
-            env.load(other.save(), mask)
-    assert env.state is before
-
-
-def test_bad_use() -> None:
-    env, single = tiny("run", 2), tiny("run")
-    single.reset(seed=0)
-    for call in (env.save, lambda: env.load(single.save(), mask=[True, False])):  # the other element has no state
-        with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
-            call()
-    env.reset(seed=0)
-    for mask in ([1, 0], [True], True):
-        with pytest.raises(ValueError, match="mask"):
-            env.load(env.save(), mask)
-
-
 @pytest.mark.parametrize("task", ["slot", "grow"])
 def test_gradients_flow_through_a_saved_moment(task: str) -> None:
     """Of a reward after a detour to actions before the saved moment; not to those of the detour."""
@@ -255,12 +218,6 @@ def test_a_state_that_is_assigned_brings_its_own_picture() -> None:
     moved = env.step(actions(env, 1)[0])[0]
     other.env_state = env.env_state  # of an environment that was never reset
     assert torch.equal(other.save().observation, moved)
-    with pytest.raises(TypeError, match="env_state"):
-        env.env_state = None
-    for unlike in (tiny("run", 3), tiny("run", particles=60), tiny("run", dtype="float32")):
-        unlike.reset(seed=0)
-        with pytest.raises(ValueError, match="env_state"):
-            env.env_state = unlike.env_state
 
 
 def test_a_moment_goes_through_a_file(tmp_path) -> None:
