@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from dittogym.bodies.json_values import to_values
 from dittogym.bodies.positions import MAX_SEED
 from dittogym.render.frame import frame, pace
-from dittogym.render.recording import Recording, as_function, film
+from dittogym.render.recording import Act, Recording, as_function, film
 from dittogym.render.scene import check_size, describe
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
@@ -219,12 +219,12 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
         """
+        return film(self.torch_env, self.acting(policy), path, seed, **options)
+
+    def acting(self, policy: Any) -> Act:
+        """A policy of one robot, see :meth:`film`, as a function that the batch of one can be driven by."""
         act = as_function(policy, self.torch_env.action_layout)
-
-        def act_on_batch(images: np.ndarray) -> torch.Tensor:
-            return as_tensor(act(images[0]), self.torch_env, single=True)
-
-        return film(self.torch_env, act_on_batch, path, seed, **options)
+        return lambda images: as_tensor(act(images[0]), self.torch_env, single=True)
 
     def _repr_png_(self) -> bytes | None:
         return self.torch_env._repr_png_()

@@ -24,7 +24,7 @@ from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import QUANTITIES, Shot, describe, take
 from dittogym.rewards import features_of
-from dittogym.snapshots import Snapshot, check_snapshot, constants_of, kind_of
+from dittogym.snapshots import Snapshot, check_snapshot, constants_of
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
@@ -118,7 +118,8 @@ class TorchEnv:
         random = self.model.camera.pixels  # with full counts, both as in the reference
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
-        core.check_rewards(self.model, self._initial_positions.even(2, self._like))
+        trial = InitialPositions(self.spec, counts, 2, random=False, resample=False)
+        core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
@@ -189,11 +190,11 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self.observation()))
-        return Snapshot(kind_of(self.model), state, observation, self._constants)
+        return Snapshot(state, observation, self._constants)
 
     @functools.cached_property
     def _constants(self) -> dict[str, str]:
-        return constants_of(self.model)
+        return constants_of(self.model, self._like)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Restore a snapshot; the simulation continues bit for bit as it did before.
@@ -213,7 +214,7 @@ class TorchEnv:
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        check_snapshot(snapshot, self.model, self._constants, self._like)
+        check_snapshot(snapshot, self._constants, self.num_envs)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
@@ -261,7 +262,6 @@ class TorchEnv:
             physics = merged(self.spec, physics, values, mask, self._like)
             core.check_stability(self.model, physics)
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
-        assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
         # Indexing saves the index for the backward pass, which `detach(physics=False)` would make impossible to repeat.
         own = tree.map(lambda t: t[index], physics) if len(index) < self.num_envs else physics
