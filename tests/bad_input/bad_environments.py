@@ -50,8 +50,8 @@ def step(made, action):
     return made.step(action)
 
 
-def action(*shape, **options):
-    return begun().step(torch.zeros(shape or (2, 2, 8, 8), **options))
+def action(**options):
+    return begun().step(torch.zeros((2, 2, 8, 8), **options))
 
 
 def reset(seed=None, **options):
@@ -64,13 +64,9 @@ def physics(**values):
 
 def load(mask=None, **changes):
     """A snapshot of an environment that differs."""
-    return begun().load(begun(**changes).save() if changes.get("num_envs", 2) == 2 else _of_three(), mask)
-
-
-def _of_three():
-    made = env(num_envs=3)
-    made.reset(seed=0)
-    return made.save()
+    other = env(**{"num_envs": 2, **changes})
+    other.reset(seed=0)
+    return begun().load(other.save(), mask)
 
 
 def state(**changes):
@@ -149,8 +145,6 @@ VALUES = [
     ("particles[0]", lambda: env(particles=(1.5,))),
     ("substeps", lambda: env(substeps=NAN)),
     ("dt", lambda: env(dt=3e-4, substeps=None)),
-    ("dt", lambda: env(dt=0.0)),
-    ("dt", lambda: env(dt="short")),
     ("dtype", lambda: env(dtype=torch.float16)),
     ("device", lambda: env(device="abacus")),
     ("action_layout", lambda: env(action_layout="page")),
@@ -164,7 +158,7 @@ VALUES = [
     ("size", lambda: observation_resolution(batch(), 65)),
     ("action", lambda: step(action_resolution(single(), 4), np.zeros((2, 5, 5), np.float32))),
     # Resets, snapshots and states.
-    *(("seed", lambda seed=seed: reset(seed)) for seed in (1.5, 2**32 - 1, [1], [1, -2], np.array([1.0, 2.0]))),
+    *(("seed", lambda seed=seed: reset(seed)) for seed in (1.5, 2**32 - 1, [1], [1, -2])),
     ("options", lambda: env().reset(options=[1])),
     ("'position'", lambda: reset(position=0)),
     ("reset_mask", lambda: reset(reset_mask=[1, 0])),
@@ -173,18 +167,19 @@ VALUES = [
     ("positions", lambda: reset(positions=np.zeros((59, 2)))),
     ("positions", lambda: reset(positions=np.full((60, 2), NAN))),
     ("positions", lambda: reset(positions=np.linspace((0.0, 0.5), (2.0, 0.5), 60))),  # outside the window
-    ("positions", lambda: reset(positions=np.linspace((0.4, -0.5), (0.5, 0.5), 60))),
     ("physics", lambda: reset(physics=3.0)),
     ("'nu'", lambda: physics(nu=0.3)),
-    *(("physics['mu']", lambda mu=mu: physics(mu=mu)) for mu in (True, 1j, "stiff", None, [[1.0], [1.0, 2.0]])),
-    *(("physics['mu']", lambda mu=mu: physics(mu=mu)) for mu in ([1.0, 2.0, 3.0], [1.0, -2.0], NAN)),
+    *(
+        ("physics['mu']", lambda mu=mu: physics(mu=mu))
+        for mu in (True, "stiff", [[1.0], [1.0, 2.0]], [1.0] * 3, [1.0, -2.0])
+    ),
     ("physics['max_actuation']", lambda: physics(max_actuation=torch.ones(2, 60))),
     ("physics['yield_stress']", lambda: physics(yield_stress=-1.0)),
     ("physics['lam']", lambda: physics(lam=[50.0, -5000.0])),
     ("physics['lam']", lambda: physics(lam=-70.0, mu=torch.tensor([[60.0, 80.0]]).repeat(2, 30))),
     *(("physics['gravity']", lambda g=g: physics(gravity=g)) for g in (-9.0, (0.0, NAN), (0.0, -1e12))),
     *(("physics['mass']", lambda mass=mass: physics(mass=mass)) for mass in (0.0, 1e30)),
-    *(("mask", lambda mask=mask: load(mask)) for mask in ("x", [1, 0], [True], True)),
+    *(("mask", lambda mask=mask: load(mask)) for mask in ("x", [1, 0], [True])),
     ("task", lambda: load(task="grow")),
     ("particles", lambda: load(particles=59)),
     ("dtype", lambda: load(dtype="float64")),
@@ -196,25 +191,22 @@ VALUES = [
     *(("env_state", lambda c=c: state(**c)) for c in ({"particles": 120}, {"particles": 9}, {"dtype": "float64"})),
     # Steps, pictures and films.
     ("action", lambda: begun().step(np.zeros((2, 2, 8, 8)))),
-    ("action", lambda: action(2, 2, 8, 7)),
     ("action", lambda: action(dtype=torch.int64)),
     ("action", lambda: action(device="meta")),
     ("action", lambda: begun().step(torch.zeros(2, 2, 8, 8).to_sparse())),
     ("action", lambda: begun().step(torch.full((2, 2, 8, 8), NAN))),
-    ("action", lambda: begun().step(torch.full((2, 2, 8, 8), 1e300, dtype=torch.float64))),
     ("action", lambda: step(single(), np.ma.masked_all((2, 8, 8)))),
     ("action", lambda: step(single(), "left")),
     ("action", lambda: step(single(), [[1.0], [1.0, 2.0]])),
     ("action", lambda: step(single(), torch.zeros(2, 8, 8).to_sparse())),
     ("action", lambda: step(batch(), np.zeros((3, 2, 8, 8)))),
     ("soft", lambda: begun().step(torch.zeros(2, 2, 8, 8), soft="no")),
-    *(("action", lambda s=s: pure(torch.zeros(s))) for s in ((2, 8, 8), (1, 2, 8, 8), (2, 1, 8, 8), (2, 2, 65, 65))),
+    ("action", lambda: pure(torch.zeros(2, 2, 65, 65))),
     ("action", lambda: pure(torch.zeros(2, 2, 8, 8, dtype=torch.float64))),
-    *(("positions", lambda p=p: pure_reset(p)) for p in (torch.zeros(1, 59, 2), torch.zeros(60, 2), [[0.1, 0.1]])),
+    ("positions", lambda: pure_reset(torch.zeros(60, 2))),
     ("physics", lambda: pure_reset(torch.full((1, 60, 2), 0.3), young=torch.ones(1))),
     ("zoom", lambda: begun().render(zoom=1e-9)),
     ("size", lambda: begun().render(size=3)),
-    ("size", lambda: begun().render(size=10**6)),
     ("policy", film),
     ("policy", lambda: film(policy=OfTheGrid())),
     ("path", lambda: film("film.avi")),
@@ -224,8 +216,6 @@ VALUES = [
     ("zoom", lambda: film("film.gif", zoom=0)),
     ("pictures", lambda: film("film.png", pictures=0)),
     ("size", lambda: film("film.html", size=64)),  # without effect
-    ("speed", lambda: film("film.png", speed=1)),
-    ("pictures", lambda: film("film.webp", pictures=4)),
     ("max_steps", lambda: film(max_steps=0)),
     ("env", lambda: trajectories.record(begun(), lambda seen: None)),
     ("fields", lambda: trajectories.record(env(), lambda seen: None, fields=("x", "y"))),
@@ -233,7 +223,6 @@ VALUES = [
     ("episodes", lambda: trajectories.save_episodes("a.npz", [])),
     # Bodies and obstacles.
     ("body", lambda: body(np.zeros((8, 8), bool))),
-    ("body", lambda: body([(0, 0), (1, 0)])),
     ("body", lambda: body([(0, 0), (1, 0), (0, NAN)])),
     ("body", lambda: body([(0, 0), (1, 1), (2, 2)])),
     ("body", lambda: body("no/such/file.png")),
@@ -246,8 +235,7 @@ VALUES = [
     ("robot", lambda: body([(0, 0), (6, 0), (6, 1), (0, 1)])),  # torn from the start
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Disc((0.17, 0.02), 0.06), 100),)))),
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)))),
-    *(("target", lambda t=t: target(t)) for t in ("heart", 3, np.zeros((64, 64), bool), np.zeros((0, 3)))),
-    *(("target", lambda t=t: target(t)) for t in (np.full((8, 8), 2.0), np.full((8, 8), NAN), np.ones((8, 8), int))),
+    *(("target", lambda t=t: target(t)) for t in ("heart", 3, np.zeros((64, 64), bool), np.full((8, 8), 2.0))),
     ("corner", lambda: Disc("home", 0.1)),
     ("draws", lambda: Rectangle((0, 0), (1, 1), draws=0)),
     ("mask", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1)),
@@ -267,27 +255,23 @@ VALUES = [
     ("variant", lambda: make_spec("slot", variant="soft")),
     ("goal", lambda: env(task=replace(make_spec("grow"), goal=(9.0, 0.0)))),
     ("goal", lambda: spec(goal=(1.0, 2.0, 3.0))),
-    ("target", lambda: spec(target=np.zeros((64, 64)))),
     ("target", lambda: spec(target=np.zeros((3, 3), bool))),
     ("patch", lambda: spec(patch=200)),
     ("objects", lambda: spec(objects=(spec().robot,) * 2)),
     ("max_actuation", lambda: spec(max_actuation=-5.0)),
     ("patch_centre y", lambda: spec(patch_centre=(None, "up"))),
-    ("patch_centre", lambda: spec(patch_centre=(None, 5.0))),
     ("view", lambda: spec(view=(-0.1, 0.5))),
     ("coarse", lambda: spec(coarse=17)),
     ("weights['action']", lambda: spec(weights={"action": -2e-4})),
     ("weights", lambda: returned({"heigth": 7.0})),
     ("weights", lambda: returned({"height": 7.0, "alve": 1.0})),
     ("'height'", lambda: returned(terms={"height": torch.zeros(3)})),
-    ("terms", lambda: returned(terms={"height": torch.zeros(2) * 1j})),
     ("terms", lambda: returned(terms={"alive": torch.zeros(2)})),
     ("terminated", lambda: returned(terminated=torch.zeros(2, 2, dtype=torch.bool))),
     ("success", lambda: returned(success=torch.zeros(2))),
     ("info", lambda: returned(info={"com": torch.zeros(2)})),
     ("'_risen'", lambda: returned(info={"_risen": torch.zeros(2)})),
     ("'risen'", lambda: returned(info={"risen": 1.0})),
-    ("task_state", lambda: returned(task_state={"best": torch.zeros(2)})),
     ("task_state", lambda: returned(task_state={"first": torch.zeros(2)})),
     ("initial_task_state", lambda: returned(start={"peak": 1.0})),
     ("width", lambda: EXACT.heaviside(ONE, 0.0)),
@@ -299,7 +283,6 @@ VALUES = [
 ]
 TYPES = [
     ("'colour'; its options", lambda: env(colour="red")),
-    ("'parity'; its options", lambda: env(parity="reference")),
     ("'target'; its options", lambda: make_spec(make_spec("run"), target="star")),
     ("'sped'", lambda: film("film.mp4", sped=1)),
     ("path", lambda: film(size=64)),

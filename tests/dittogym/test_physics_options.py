@@ -42,9 +42,6 @@ def strain(env: TorchEnv, count: int | None = None) -> torch.Tensor:
     return (env.state.F[:, :count] - torch.eye(2, dtype=env.dtype)).flatten(2).norm(dim=2).mean(1)
 
 
-# In which forms values may come.
-
-
 def test_numbers_and_lists_are_as_exact_as_arrays() -> None:
     """torch would make them float32, or whatever its default is, first."""
     env = tiny("kick", 2)
