@@ -182,10 +182,9 @@ class TorchEnv:
             self._observation = core.observe(self.model, self.env_state)
         return self._observation
 
-    def detach(self, *, physics: bool = True) -> None:
-        """Detach the state from the autograd graph, with ``physics=False`` except for the physics of the last reset."""
-        state = tree.detach(self.env_state)
-        self._env_state = state if physics else replace(state, physics=self.env_state.physics)
+    def detach(self) -> None:
+        """Detach the state, and the physics of the last reset, from the autograd graph."""
+        self._env_state = tree.detach(self.env_state)
 
     def save(self) -> Snapshot:
         """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
@@ -263,9 +262,7 @@ class TorchEnv:
             core.check_stability(self.model, physics)
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         index = mask.nonzero()[:, 0]
-        # Indexing saves the index for the backward pass, which `detach(physics=False)` would make impossible to repeat.
-        own = tree.map(lambda t: t[index], physics) if len(index) < self.num_envs else physics
-        fresh, observation = core.reset(self.model, drawn.positions[index], own)
+        fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
         info = core.info_of(self.model, fresh, fresh.start)
         if len(index) < self.num_envs:
             old = self.env_state

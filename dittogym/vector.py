@@ -141,14 +141,15 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return self._step_then_reset(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
         rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
-        images, info = as_numpy(step.observation), as_numpy(step.info)
-        if step.reset_info is None:
-            return images, rewards, ends, limits, _with_masks(info, np.ones_like(ends))
-        done, finals, final = _array(step.done), as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
-        for i in np.flatnonzero(done):
-            final[i] = finals[i]
-        last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
-        return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
+        images, info, done = as_numpy(step.observation), as_numpy(step.info), _array(step.done)
+        result = _restarted(info, as_numpy(step.reset_info or {}), done)
+        if done.any():
+            finals, final = as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
+            for i in np.flatnonzero(done):
+                final[i] = finals[i]
+            result |= {"final_obs": final, "_final_obs": done}
+            result |= {"final_info": _with_masks(info, done), "_final_info": done}
+        return images, rewards, ends, limits, result
 
     def _step_then_reset(self, action: torch.Tensor) -> tuple[Any, ...]:
         """A step after which, in the mode ``NEXT_STEP``, elements that had ended before it are reset."""
