@@ -206,18 +206,8 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> Recording:
         """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
 
-        Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
-
-        Args:
-            policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
-                ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
-            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Seed of the reset and of the policy's noise.
-            options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
-                and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
-
-        Returns:
-            The recording, from which further films can be saved. A notebook shows it.
+        The policy gets one observation (3, 64, 64) and returns one action (2, R, R). Wrappers have no part in it: an
+        environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
         """
         return film(self.torch_env, self.acting(policy), path, seed, **options)
 

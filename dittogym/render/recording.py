@@ -163,15 +163,17 @@ class Recording:
             time = min(number * speed / rate, self.duration)
             total = returns[min(round(time / self.scene.dt), len(self.rewards))]
             caption = f"{self.scene.task}   {self._clock(time)}", f"return {total:.1f}   {pace(speed)}"
-            yield self.picture(time, size=options.size, zoom=options.zoom, muscles=options.muscles, caption=caption)
+            yield self._picture(time, options, caption)
 
     def _strip(self, options: FilmOptions) -> np.ndarray:
         gap = np.full((options.size, max(1, options.size // 64), 3), 255, np.uint8)
         strip = []
         for time in np.linspace(0, self.duration, options.pictures):
-            shown = {"size": options.size, "zoom": options.zoom, "muscles": options.muscles}
-            strip += [self.picture(time, caption=(self._clock(time), ""), **shown), gap]
+            strip += [self._picture(time, options, (self._clock(time), "")), gap]
         return np.concatenate(strip[:-1], axis=1)
+
+    def _picture(self, time: float, options: FilmOptions, caption: tuple[str, str]) -> np.ndarray:
+        return self.picture(time, size=options.size, zoom=options.zoom, muscles=options.muscles, caption=caption)
 
     def _clock(self, time: float) -> str:
         """A time in s with so many digits that steps can be told apart."""
