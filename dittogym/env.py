@@ -206,8 +206,9 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> Recording:
         """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
 
-        The policy gets one observation (3, 64, 64) and returns one action (2, R, R). Wrappers have no part in it: an
-        environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
+        ``path``, ``seed`` and ``options`` are as there; ``policy`` gets one observation (3, 64, 64) and returns one
+        action (2, R, R). Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with
+        ``env.unwrapped.film``.
         """
         return film(self.torch_env, self.acting(policy), path, seed, **options)
 
