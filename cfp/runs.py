@@ -69,7 +69,7 @@ class Run:
 
         Args:
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+            options: Such as ``size``, ``speed`` and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
         """
         check_film(path, options)  # before the episode
         recording = record_policy(self.config, self.policy)
