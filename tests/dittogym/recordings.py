@@ -164,13 +164,13 @@ def _first_grid(data: dict[str, np.ndarray], env: reference.ReferenceEnv, record
     }
 
 
-def episode_errors(data: dict[str, np.ndarray], steps: int | None = None) -> dict[str, float]:
-    """Largest difference over the recorded episode, or its first ``steps``, measured as :data:`EPISODE` says."""
+def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
+    """Largest difference over the recorded episode, in the measure that :data:`EPISODE` names."""
     env = make(data)
     inner = env.torch_env
     robot = inner.model.num_robot_particles
     rows: dict[str, list[Any]] = {name: [] for name in EPISODE}
-    for t in range(len(data["actions"][:steps])):
+    for t in range(len(data["actions"])):
         observation, reward, terminated, _, info = env.step(action(data, env, t))
         x, v, F = env.state.x[0, :robot], env.state.v[0], env.state.F[0, :robot]
         rows["com"].append(info["com"])
@@ -187,7 +187,7 @@ def episode_errors(data: dict[str, np.ndarray], steps: int | None = None) -> dic
         rows["obs"].append(observation)
     ours = {name: np.stack(values) for name, values in rows.items() if values}
     ours["obs"] = ours["obs"][:: data.get("image_stride", 1)]
-    errors = {name: worst(values, data[name][: len(values)]) for name, values in ours.items()}
+    errors = {name: worst(values, data[name]) for name, values in ours.items()}
     if inner.spec.name in SHARES and robot != make_spec(inner.spec.name).robot.count:
         del errors["reward"]
     else:
@@ -198,8 +198,7 @@ def episode_errors(data: dict[str, np.ndarray], steps: int | None = None) -> dic
         early = worst(ours["reward"][:10], data["reward"][:10]), worst(ours["com"][9], data["com"][9])
         task = inner.spec.name
         errors["rest"] = max(early[0] / REST_REWARD.get(task, 1e-3), early[1] / REST_CENTRE.get(task, 2e-5))
-    seen = data["obs"][: len(ours["obs"])]
-    errors["obs"] = float((np.abs(ours["obs"].astype(int) - seen.astype(int)) > 8).mean())
+    errors["obs"] = float((np.abs(ours["obs"].astype(int) - data["obs"].astype(int)) > 8).mean())
     return errors
 
 
