@@ -504,5 +504,5 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             return []
         return [
             f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
-            "evaluate it from other starts (python -m baselines.evaluate --policy), or use mpc, which plans anew"
+            "evaluate it from other starts (torchmpm evaluate --policy), or use mpc, which plans anew"
         ]

@@ -91,10 +91,7 @@ def test_tasks_of_the_working_directory_are_found(tmp_path):
 
 MODULES = (
     *(f"cfp.{name}" for name in ("train", "evaluate", "robustness", "play")),
-    *(
-        f"baselines.{name}"
-        for name in ("train", "evaluate", "replay", "robustness", "distill", "compare", "leaderboard")
-    ),
+    *(f"baselines.{name}" for name in ("train", "compare", "leaderboard")),
 )
 
 

@@ -11,8 +11,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import baselines
 import dittogym
-from baselines import OpenLoop, evaluate, replay, robustness, train
+from baselines import OpenLoop, train
 from baselines.registry import configure, find, sees
+from cfp import evaluate, robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.envs.disturbances import make_cases
@@ -105,7 +106,7 @@ def test_run_leaves_its_files(finished):
     assert [row["policy"] for row in rows] == ["zero action", "random action", *TINY[algo][2]]
 
 
-def test_policy_is_loaded_by_its_kind_and_evaluated(finished, capsys):
+def test_policy_is_loaded_by_its_kind_and_evaluated(finished, tmp_path, capsys):
     algo, folder = finished
     images, policy = np.zeros((3, 3, 64, 64), np.uint8), baselines.load(folder)
     if isinstance(policy, StatePolicy):
@@ -117,8 +118,10 @@ def test_policy_is_loaded_by_its_kind_and_evaluated(finished, capsys):
     size = 64 if algo.startswith(("gnn", "transformer")) else 8
     assert policy.description["resolution"] == size and policy.description["task"] == "shapematch"
     capsys.readouterr()
-    assert evaluate.main([str(folder), "--episodes", "2", "--json", "--device", "cpu"]) == 0
+    words = ["--episodes", "2", "--json", "--device", "cpu", "--replay", str(tmp_path / "replay.html")]
+    assert evaluate.main([str(folder), *words]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
+    assert "<!doctype html>" in (tmp_path / "replay.html").read_text()[:100].lower()
 
 
 @pytest.mark.parametrize("finished", algorithms(slow=LARGE | ALIKE), indirect=True)
@@ -147,15 +150,6 @@ def test_robustness_is_reported_whatever_trained_it(finished, monkeypatch):
     rows = json.loads((folder / "robustness.json").read_text())
     assert rows[0]["case"] == "unperturbed" and {row["episodes"] for row in rows} == {1}
     assert baselines.load(folder).uses_image == any("observation" in row["case"] for row in rows)
-
-
-@pytest.mark.parametrize("finished", ["gnn-16"], indirect=True)
-def test_episode_is_written_to_watch(finished, tmp_path, capsys):
-    page = tmp_path / "replay.html"
-    assert replay.main([str(finished[1]), "--out", str(page)]) == 0
-    assert "<!doctype html>" in page.read_text()[:100].lower()
-    assert replay.main([str(finished[1]), "--out", "replay.txt"]) == 2
-    assert "out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("finished", ["gradient"], indirect=True)
