@@ -66,10 +66,10 @@ TINY = {
     "cem": (f"{PLANNED} --iterations 2 --candidates 5 --elites 2", 5, ["stage 1", "  own layout"]),
     "shac": (f"{WINDOWS} --grid 8 --max-episode-steps 6", 60, ["stage 1"]),
 }
-#: The same programs as with 16 segments, and several times slower; and as coarse, with another grid.
-LARGE = {"gnn-64", "transformer-64", "fine"}
-#: The same programs as cfp-sac, mpc and gnn-16, with a single stage, another planner and other networks.
-ALIKE = {"coarse", "cem", "transformer-16"}
+#: The same programs as gnn-16 and coarse, with more segments, other networks and another grid.
+LARGE = {"gnn-64", "transformer-16", "transformer-64", "fine"}
+#: The same programs as cfp-sac and mpc, with a single stage and another planner.
+ALIKE = {"coarse", "cem"}
 #: Algorithms whose policies are those of the coarse-to-fine method.
 LEVELS = ("cfp-analytic", "cfp-sac", "coarse", "distill", "fine")
 
