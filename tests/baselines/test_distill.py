@@ -37,6 +37,7 @@ def options(**changes):
         "iterations": 1,
         "planner_grid": 4,
         "resolutions": (8, 16),
+        "encoder": "small",
     }
     defaults |= {"rollout_steps": 4, "updates": 2, "switch_every": 2, "batch_size": 8}
     return replace(Distill.preset("run", "quick"), **defaults | changes)
