@@ -27,44 +27,44 @@ pytestmark = pytest.mark.usefixtures("short")
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 REWARDS = (
-    "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
+    "--num-envs 2 --steps 40 --random-steps 8 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
     "--eval-every 20 --checkpoint-every 10 --log-every 10"
 )
 WINDOWS = (
-    "--train-particles 100 --num-envs 2 --steps 96 --window 6 --critic-updates 2 --eval-every 48 --checkpoint-every 12 "
-    "--log-every 24"
+    "--train-particles 100 --num-envs 2 --steps 48 --window 6 --critic-updates 2 --eval-every 24 --checkpoint-every 12 "
+    "--log-every 12"
 )
 PLANNED = "--grid 8 --horizon 3 --commit 2 --eval-every 3 --checkpoint-every 2 --log-every 2"
 # A tiny run of each algorithm: options, a step at which it is stopped, its policies.
 TINY = {
     "cfp-analytic": (
         f"{WINDOWS} --handover 0.5 --resolutions 4 8 --minibatches 2 --minibatch-size 8",
-        60,
+        36,
         ["stage 1", "stage 2"],
     ),
-    "cfp-sac": (f"{REWARDS} --resolutions 4 8 --handover 0.5 --random-steps 10 4", 44, ["stage 1", "stage 2"]),
-    "coarse": (f"{REWARDS} --resolutions 8", 44, ["stage 1"]),
-    "fine": (f"{REWARDS} --resolutions 8", 44, ["stage 1"]),
-    "gnn-16": (REWARDS, 44, ["stage 1"]),
-    "gnn-64": (REWARDS, 44, ["stage 1"]),
-    "transformer-16": (REWARDS, 44, ["stage 1"]),
-    "transformer-64": (REWARDS, 44, ["stage 1"]),
+    "cfp-sac": (f"{REWARDS} --resolutions 4 8 --handover 0.5 --random-steps 8 4", 34, ["stage 1", "stage 2"]),
+    "coarse": (f"{REWARDS} --resolutions 8", 34, ["stage 1"]),
+    "fine": (f"{REWARDS} --resolutions 8", 34, ["stage 1"]),
+    "gnn-16": (REWARDS, 34, ["stage 1"]),
+    "gnn-64": (REWARDS, 34, ["stage 1"]),
+    "transformer-16": (REWARDS, 34, ["stage 1"]),
+    "transformer-64": (REWARDS, 34, ["stage 1"]),
     "distill": (
         "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
-        "--resolutions 4 8 --steps 60 --handover 0.5 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--resolutions 4 8 --steps 40 --handover 0.5 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
         "--checkpoint-every 10 --log-every 10",
-        50,
+        34,
         ["stage 1", "stage 2"],
     ),
     "gradient": (
-        "--iterations 5 --grid 4 --train-particles 100 --polish 3 --polish-grid 8 "
-        "--eval-every 24 --checkpoint-every 8 --log-every 8",
-        48,
+        "--iterations 3 --grid 4 --train-particles 100 --polish 2 --polish-grid 8 "
+        "--eval-every 16 --checkpoint-every 8 --log-every 8",
+        32,
         ["stage 1", "stage 2", "  own layout"],
     ),
     "mpc": (f"{PLANNED} --iterations 1 --train-particles 60", 5, ["stage 1", "  own layout"]),
     "cem": (f"{PLANNED} --iterations 2 --candidates 5 --elites 2", 5, ["stage 1", "  own layout"]),
-    "shac": (f"{WINDOWS} --grid 8 --max-episode-steps 6", 60, ["stage 1"]),
+    "shac": (f"{WINDOWS} --grid 8 --max-episode-steps 6", 36, ["stage 1"]),
 }
 #: The same programs as gnn-16 and coarse, with more segments, other networks and another grid.
 LARGE = {"gnn-64", "transformer-16", "transformer-64", "fine"}
