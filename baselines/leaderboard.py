@@ -130,7 +130,7 @@ def candidates(name: str, tasks: Sequence[str]) -> list[tuple[dict[str, Any], Po
         about = {
             "policy": _shown_name(name, task),
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "sees": description.get("sees", sees(algo_of(description))),
+            "sees": sees(algo_of(description)),
             "training": {"steps": description["steps"], "minutes": _minutes(file.parent)},
         }
     for task in found:

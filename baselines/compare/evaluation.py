@@ -63,8 +63,8 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
         policy, observes = REFERENCE_POLICIES[run.options["algo"]](config), "nothing"
     else:
         there = baselines.Run(run.folder)
-        config, policy, about = there.config, there.policy, there.policy.description
-        observes = about.get("sees", sees(algo_of(about)))
+        config, policy = there.config, there.policy
+        observes = sees(algo_of(policy.description))
     device = choose_device(run.options["device"])
     config = replace(config, seed=0, device=device, particles=protocol.particles)
     deterministic = protocol.deterministic(run.task)

@@ -197,9 +197,9 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
     config = configure({"algo": "coarse", "resolutions": [8], "substeps": 1, "encoder": "paper"})
     start = tmp_path / "start.safetensors"
     save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)
-    words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
+    words = ["--refine", "--start-from", str(start), "--resolutions", "8", "--steps", "24", "--eval-every", "24"]
     stop_at(12)
-    assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
+    assert run("cfp-analytic", tmp_path / "run", *words, "--warmup", "0") == 128 + signal.SIGINT
     assert baselines.load(tmp_path / "run").description["steps"] == 0
     monkeypatch.undo()
     start.unlink()
@@ -226,7 +226,6 @@ SAC = {"num_envs": 2, "batch_size": 4, "buffer_size": 60, "update_start": 8}
 TEACHING = {"teacher": "mpc", "planner_grid": 4, "horizon": 2, "commit": 2, "iterations": 1, "rollout_steps": 4}
 CONFORMS = {
     "shac": SHAC,
-    "shac image": SHAC | {"sees": "image"},
     "coarse": SAC | {"resolutions": [8], "random_steps": [4]},
     "gnn-16": SAC | {"random_steps": 4},
     "distill": TEACHING | {"num_envs": 2, "train_particles": 100, "resolutions": [8], "updates": 1, "batch_size": 4},
@@ -235,9 +234,8 @@ CONFORMS = {
 
 @pytest.mark.parametrize("name", CONFORMS)
 def test_algorithm_is_one_of_stable_baselines3(name, tmp_path):
-    algo, more = name.split()[0], CONFORMS[name]
-    config = configure({"algo": algo, "particles": 100, "substeps": 1, "device": "cpu", **more})
-    model = find(algo).create(config, 1, tmp_path)
+    config = configure({"algo": name, "particles": 100, "substeps": 1, "device": "cpu", **CONFORMS[name]})
+    model = find(name).create(config, 1, tmp_path)
     stops = StopsAfter(5)
     model.learn(100, stops)
     assert stops.n_calls == 5 and model.num_timesteps == 10
