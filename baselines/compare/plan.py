@@ -24,7 +24,7 @@ LARGEST_SEED = EVALUATION_SEED - 1001
 #: What the command line of the comparison gives to every run.
 GIVEN = ("device", "preset", "seed", "task")
 #: Options that define the task, which must be the same for all algorithms on it.
-TASK_OPTIONS = ("dt", "dtype", "resample", "substeps", "target", "variant")
+SAME_FOR_ALL = ("dt", "dtype", "resample", "substeps", "target", "variant")
 #: Options that change neither what a run learns nor which policy it keeps.
 WITHOUT_INFLUENCE = ("backend", "checkpoint_every", "device", "log_every", "video")
 #: What a comparison keeps in the folder of a run: its options, its training time and its evaluation.
@@ -105,7 +105,7 @@ def resolved(options: Options) -> RunConfig:
 
 def reference_config(options: Options) -> RunConfig:
     """The configuration in whose environment a reference policy acts, that of a single stage of learning."""
-    kept = {name: value for name, value in options.items() if name in ("task", *TASK_OPTIONS)}
+    kept = {name: value for name, value in options.items() if name in ("task", *SAME_FOR_ALL)}
     preset = "paper" if options["preset"] == "paper" else "quick"
     return resolved({"algo": "coarse", "preset": preset, **kept})
 
@@ -125,9 +125,9 @@ def read_plan(path: Path | None) -> dict[str, Any]:
     for task, options in _check_section("tasks", plan["tasks"]).items():
         _check_section(f"tasks.{task}", options, GIVEN)
     for label, options in _check_section("algos", plan["algos"]).items():
-        _check_section(f"algos.{label}", options, (*GIVEN, *TASK_OPTIONS))
+        _check_section(f"algos.{label}", options, (*GIVEN, *SAME_FOR_ALL))
         for task, own in _check_section(f"algos.{label}.tasks", options.get("tasks", {})).items():
-            _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *TASK_OPTIONS))
+            _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *SAME_FOR_ALL))
     return plan
 
 

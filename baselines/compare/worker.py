@@ -24,7 +24,7 @@ IN_USE = 3
 WAIT = 120.0
 
 
-def carry_out(run: Run, protocol: Protocol) -> int:
+def train_and_evaluate(run: Run, protocol: Protocol) -> int:
     """Do what is left of a run; returns an exit code, that of the training if it is not 0."""
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -56,7 +56,7 @@ def main() -> int:
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     values = json.loads(sys.argv[1])
     run = Run(**values["run"] | {"folder": Path(values["run"]["folder"])})
-    return carry_out(run, Protocol(**values["protocol"]))
+    return train_and_evaluate(run, Protocol(**values["protocol"]))
 
 
 if __name__ == "__main__":

@@ -113,7 +113,6 @@ OTHERS = (
         "distill",
         ("--teacher run", "teacher must be a policy for shapematch"),
         ("--num-layouts 5000", "num_layouts must be at most"),
-        ("--capacity 0", "capacity must be at least 1, got 0"),
     )
     + rows(
         "evaluate",

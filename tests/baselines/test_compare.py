@@ -55,7 +55,7 @@ def call_here(words, run, threads, urgency):
     output = io.StringIO()
     values = json.loads(words[-1])
     with contextlib.redirect_stderr(output):
-        code = worker.carry_out(run, Protocol(**values["protocol"]))
+        code = worker.train_and_evaluate(run, Protocol(**values["protocol"]))
     return code, output.getvalue().rstrip().rpartition("\n")[2]
 
 
@@ -268,7 +268,7 @@ def test_a_folder_in_use_is_left_alone(finished, monkeypatch):
     options = json.loads((folder / "comparison.json").read_text())["options"]
     before = (folder / "comparison.json").read_bytes()
     with FileLock(folder / ".comparison.lock"):
-        code = worker.carry_out(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100))
+        code = worker.train_and_evaluate(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100))
     assert code == worker.IN_USE and (folder / "comparison.json").read_bytes() == before
 
 
