@@ -176,9 +176,9 @@ def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode
     return [record_episode(config, policy, deterministic, seed, recorder) for seed in seeds]
 
 
-def main(arguments: Sequence[str] | None = None, module: str = "cfp.evaluate") -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return run_command(lambda: print(run(read_command(Command, module, EXAMPLES, arguments))))
+    return run_command(lambda: print(run(read_command(Command, "cfp.evaluate", EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

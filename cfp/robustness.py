@@ -177,9 +177,9 @@ def run(command: Command) -> str:
     return f"{table.to_markdown()}\n\nbar plot: {path.with_suffix('.png')}"
 
 
-def main(arguments: Sequence[str] | None = None, module: str = "cfp.robustness") -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return run_command(lambda: print(run(read_command(Command, module, EXAMPLES, arguments))))
+    return run_command(lambda: print(run(read_command(Command, "cfp.robustness", EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

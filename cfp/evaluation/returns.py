@@ -232,6 +232,14 @@ def play(
 # Their returns.
 
 
+def t_interval(values: Sequence[float]) -> float | None:
+    """Half the width of the 95 % confidence interval of a mean (Student's t); None for fewer than two values."""
+    count = len(values)
+    if count < 2:
+        return None
+    return float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(count))
+
+
 @dataclass(frozen=True)
 class Result:
     """Undiscounted returns of some episodes of a policy."""
@@ -253,11 +261,8 @@ class Result:
 
     @property
     def interval(self) -> float | None:
-        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
-        count = len(self.returns)
-        if count < 2:
-            return None
-        return float(stdtrit(count - 1, 0.975) * np.std(self.returns, ddof=1) / math.sqrt(count))
+        """Half the width of the 95 % confidence interval of the mean; None for one episode."""
+        return t_interval(self.returns)
 
 
 def evaluate(

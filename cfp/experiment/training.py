@@ -133,15 +133,9 @@ def _read_file(path: str | None) -> dict[str, Any]:
         raise ConfigError(f"config: {path} cannot be read as JSON ({error})") from error
 
 
-def main(arguments: Sequence[str] | None = None, module: str = "cfp.train", prefix: Sequence[str] = ()) -> int:
-    """Train as a command line says; returns the exit code.
-
-    Args:
-        arguments: Of the command line; None: the program's own.
-        module: Module that was started, for the help.
-        prefix: Arguments that the program implies.
-    """
-    words = [*prefix, *(sys.argv[1:] if arguments is None else arguments)]
+def main(arguments: Sequence[str] | None = None, module: str = "cfp.train") -> int:
+    """Train as a command line says, None the program's own; the help shows ``module``. Returns the exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
     started = program_name(module, arguments)
 
     def run() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from bad_cases import TINY, Case, Refused, command, prepared, table
 
-import baselines.evaluate
+import baselines.registry
 import cfp
 import cfp.evaluate
 import cfp.train
@@ -144,7 +144,7 @@ def resumed(name, change, *words):
 
 def evaluated(name, change, *words):
     """A run whose folder was changed before it is evaluated."""
-    call = command(baselines.evaluate.main, "{folder}/run --episodes 1 --device cpu")
+    call = command(cfp.evaluate.main, "{folder}/run --episodes 1 --device cpu")
     return Case(f"evaluated run with {name}", prepared(lambda desk: desk.run(change), call), words, Refused)
 
 
