@@ -16,9 +16,9 @@ from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
-compiler = runpy.run_path("torchmpm/native/cpu/compiler.py")
+library = runpy.run_path("torchmpm/native/library.py")
 KERNELS = {
-    "torchmpm/native/cpu/native.cpp": [[option] for option in compiler["REAL"].values()],
+    "torchmpm/native/cpu/native.cpp": [[option] for option in library["REAL"].values()],
     "dittogym/picture.cpp": [["-ffp-contract=off"]],
 }
 
@@ -27,7 +27,7 @@ class Kernel(Extension):
     """A library for ctypes, which does not depend on the version of Python."""
 
     def __init__(self, source: str, options: list[str], processor: str) -> None:
-        path = compiler["compiled_path"](Path(source).resolve(), options, processor)
+        path = library["compiled_path"](Path(source).resolve(), options, processor)
         super().__init__(str(path.relative_to(Path.cwd())), [source], extra_compile_args=options)
         self.processor = processor
 
@@ -49,8 +49,8 @@ class BuildKernels(build_ext):
     def build_extension(self, ext: Kernel) -> None:
         out = Path(self.get_ext_fullpath(ext.name))
         out.parent.mkdir(parents=True, exist_ok=True)
-        arguments = compiler["arguments"](Path(ext.sources[0]), ext.extra_compile_args, ext.processor)
-        self.spawn([*compiler["find_compiler"](), *arguments, "-o", str(out)])
+        arguments = library["arguments"](Path(ext.sources[0]), ext.extra_compile_args, ext.processor)
+        self.spawn([*library["find_compiler"](), *arguments, "-o", str(out)])
 
 
 class AnyPython(bdist_wheel):

@@ -75,7 +75,7 @@ def test_forward(per_substep, backend: str, batch: int, count: int, device: str)
         with torch.no_grad():
             end = solver.step(state, actuation, substeps=100, origin=origin)
         finish(device)
-        assert torchmpm.diagnostics.finite(end).all()
+        assert end.is_finite().all()
 
     per_substep(run, particles=batch * count, substeps=100, rounds=8)
 
@@ -100,7 +100,7 @@ def test_materials(per_substep, bodies: str) -> None:
     def run() -> None:
         with torch.no_grad():
             end = solver.step(state, actuation, substeps=100, origin=origin)
-        assert torchmpm.diagnostics.finite(end).all()
+        assert end.is_finite().all()
 
     per_substep(run, particles=count, substeps=100, rounds=8)
 

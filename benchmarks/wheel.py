@@ -16,7 +16,7 @@ import time
 import torch
 
 import dittogym
-from torchmpm.native.cpu import library
+from torchmpm.native import library
 
 KINDS, ROUNDS, ROBOTS, STEPS = ("wheel", "compiled"), 2, 4, 5
 

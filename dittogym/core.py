@@ -16,8 +16,8 @@ from dittogym.observation import Camera
 from dittogym.physics import NAMES, Physics, bodies_of
 from dittogym.rewards import EXACT, SMOOTH, Features, Reward, RewardOps, TaskState, Transition, action_cost, features_of
 from dittogym.spec import DT, TaskSpec
-from torchmpm import ParticleState, Solver, diagnostics, tree
-from torchmpm.rollout import Segment
+from torchmpm import ParticleState, Solver, tree
+from torchmpm.checks import Segment
 from torchmpm.stability import check_gravity, stable_dt
 from torchmpm.tree import cached_tensors
 
@@ -253,7 +253,7 @@ def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Te
         state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
     )
     if guarded:
-        finite.append(diagnostics.finite(particles))
+        finite.append(particles.is_finite())
     com = particles.x[:, : model.num_robot_particles].mean(1)
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
@@ -320,7 +320,7 @@ def info_of(model: Model, state: EnvState, now: Features) -> dict[str, Tensor]:
 def is_valid(model: Model, state: EnvState) -> Tensor:
     """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
     robot = state.particles.x[:, : model.num_robot_particles].detach()
-    return diagnostics.finite(state.particles) & contains(robot, state.origin.detach()).any(1)
+    return state.particles.is_finite() & contains(robot, state.origin.detach()).any(1)
 
 
 def _transition(model: Model, state: EnvState, now: Features, observation: Tensor, ops: RewardOps) -> Transition:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dittogym.geometry import GRID, Box, Centre, Window, centre_in_window
 from torchmpm.backends import warn_eager
-from torchmpm.native.cpu.library import POOL, build, thread_pool
+from torchmpm.native.library import POOL, build, thread_pool
 from torchmpm.transfer import quadratic_weights
 from torchmpm.tree import cached_tensors, transforming
 

@@ -28,7 +28,7 @@ from dittogym.snapshots import Snapshot, check_snapshot, constants_of
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
-from torchmpm.rollout import Segment, check_repetition
+from torchmpm.checks import Segment
 from torchmpm.tree import transforming
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -100,7 +100,7 @@ class TorchEnv:
     ) -> None:
         self.spec = make_spec(task, **task_options)
         self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
-        check_repetition(substeps, segment)
+        checks.segment(segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
         if (name := str(dtype).removeprefix("torch.")) not in DTYPES:

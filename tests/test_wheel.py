@@ -13,20 +13,20 @@ from pathlib import Path
 
 import pytest
 
-from torchmpm.native.cpu import compiler, library
+from torchmpm.native import library
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        library.family() is None or compiler.find_compiler() is None,
+        library.family() is None or library.find_compiler() is None,
         reason="needs a C++ compiler and a usual processor",
     ),
 ]
 #: Simulates, differentiates, writes a replay, and serves the page to play on.
 PROGRAM = """
 import torch, dittogym
-from torchmpm.native.cpu import library
+from torchmpm.native import library
 env = dittogym.TorchEnv("run", particles="lite", backend="native", substeps=20)
 env.reset(seed=0)
 actions = torch.full((1, *env.action_shape), 0.5, requires_grad=True)

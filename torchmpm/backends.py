@@ -3,7 +3,7 @@
 import functools
 import logging
 
-from torchmpm.native.cpu.compiler import find_compiler
+from torchmpm.native.library import find_compiler
 
 BACKENDS = ("auto", "eager", "native")
 _logger = logging.getLogger(__name__)

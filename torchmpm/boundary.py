@@ -99,18 +99,10 @@ def limits(ends: Range) -> tuple[int | float, int | float]:
     return -math.inf if low is None else low, math.inf if high is None else high
 
 
-def node_shift(grid: Grid, origin: Tensor) -> Tensor:
-    """Whole nodes between the world's origin and the window's, truncated towards zero, (B, 2) int64."""
-    nodes = origin.detach() * (1.0 / grid.h)
-    nearest = nodes.round()
-    whole = (nodes - nearest).abs() <= 4 * torch.finfo(nodes.dtype).eps * nearest.abs()  # but for rounding errors
-    return torch.where(whole, nearest, nodes.trunc()).to(torch.int64)
-
-
 def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Face, ...]:
     """The rules as masks for a window at origin (B, 2), m; it does not move during a step, so they serve all of it."""
     window = torch.arange(-PAD, grid.resolution + PAD, device=origin.device)[None]
-    shift = node_shift(grid, origin)
+    shift = grid.node_shift(origin)
 
     def covered(rule: VelocityRule) -> Tensor:
         inside = []

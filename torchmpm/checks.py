@@ -3,13 +3,16 @@
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchmpm.tree import transforming
+
+#: Substeps between checkpoints; ``None``: no checkpoints; ``"auto"`` leaves it to the backend.
+Segment: TypeAlias = int | Literal["auto"] | None
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
@@ -63,6 +66,15 @@ def entries(
         return
     if below is not None and not given < below:
         raise ValueError(f"{name} must be below {below}, got {given}")
+
+
+def segment(given: Any) -> Segment:
+    """A :data:`Segment` with Python's integer, or else a ValueError."""
+    if given is None or (isinstance(given, str) and given == "auto"):
+        return cast(Segment, given)
+    if isinstance(given, bool) or not isinstance(given, Integral) or int(given) < 1:
+        raise ValueError(f"segment must be at least 1, None or 'auto', got {given!r}")
+    return int(given)
 
 
 def tensor(name: str, given: Any) -> None:

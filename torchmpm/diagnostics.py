@@ -1,4 +1,4 @@
-"""Balances of a simulation: mass, momentum and energy, and a check for non-finite values."""
+"""Balances of a simulation: mass, momentum and energy."""
 
 import torch
 from torch import Tensor
@@ -56,13 +56,6 @@ def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
     mass = masses(solver, state)
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype, device=state.device).reshape(-1, 1, 2)
     return -(mass * (state.x * gravity).sum(-1)).sum(-1)
-
-
-def finite(state: ParticleState) -> Tensor:
-    """Which simulations hold finite numbers only, (B,) bool."""
-    checks.instance("state", state, ParticleState)
-    # Zero times a finite number is zero and zero times anything else is NaN, which the sum keeps.
-    return (state.stack().detach() * 0.0).sum((0, 2)) == 0.0
 
 
 def impulses(

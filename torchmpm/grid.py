@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from torchmpm import checks
@@ -56,6 +57,13 @@ class Grid:
     def extent(self) -> float:
         """Distance from the origin at which particles leave the window to the right, m; to the left: the margin."""
         return self.resolution * self.h - self.margin
+
+    def node_shift(self, origin: Tensor) -> Tensor:
+        """Whole nodes between the world's origin and a window's at (B, 2), m, truncated towards zero, (B, 2) int64."""
+        nodes = origin.detach() * (1.0 / self.h)
+        nearest = nodes.round()
+        whole = (nodes - nearest).abs() <= 4 * torch.finfo(nodes.dtype).eps * nearest.abs()  # but for rounding errors
+        return torch.where(whole, nearest, nodes.trunc()).to(torch.int64)
 
     def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
         """Whether x (B, N), m, lies between the ends of the window from origin_x (B, 1), m; false for NaN."""

@@ -2,34 +2,22 @@
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from numbers import Integral
-from typing import Any, Literal, TypeAlias, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from torchmpm import checks, tree
+from torchmpm.checks import Segment
 from torchmpm.tree import transforming
 
 State = TypeVar("State")
 Input = TypeVar("Input")
 Output = TypeVar("Output")
 
-#: Substeps between checkpoints; ``None``: no checkpoints; ``"auto"`` leaves it to the backend.
-Segment: TypeAlias = int | Literal["auto"] | None
 #: Segment of ``"auto"`` where only checkpoints bound the memory.
 SEGMENT = 10
-
-
-def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple[int, Segment]:
-    """``times``, which the caller calls ``name``, and ``segment``, converted to Python's integers."""
-    given: Any = segment
-    if given is not None and not (isinstance(given, str) and given == "auto"):
-        if isinstance(given, bool) or not isinstance(given, Integral) or int(given) < 1:
-            raise ValueError(f"segment must be at least 1, None or 'auto', got {given!r}")
-        segment = int(given)
-    return checks.whole(name, times, 0), segment
 
 
 def repeated(
@@ -51,7 +39,7 @@ def repeated(
         ValueError: ``times`` is negative or ``segment`` is below 1.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
-    times, segment = check_repetition(times, segment)
+    times, segment = checks.whole("times", times, 0), checks.segment(segment)
     if segment is None or not _records():
         segment = max(times, 1)
     elif segment == "auto":

@@ -13,13 +13,14 @@ from torch.nn.functional import pad
 from torchmpm import checks, stability, tree
 from torchmpm.backends import BACKENDS, warn_eager
 from torchmpm.boundary import VelocityRule, faces
+from torchmpm.checks import Segment
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value, try_law
 from torchmpm.materials.body import Body, per_particle, slices
-from torchmpm.native.cpu.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.kernels import Kernels
+from torchmpm.native.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.tables import KINDS
-from torchmpm.rollout import Segment, check_repetition, repeated
+from torchmpm.rollout import repeated
 from torchmpm.state import ParticleState
 from torchmpm.substep import Components, Scene, substep
 from torchmpm.tree import transforming
@@ -212,7 +213,7 @@ class Solver:
         if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
             raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
         leave_parent_threads()
-        substeps, segment = check_repetition(substeps, segment, "substeps")
+        substeps, segment = checks.whole("substeps", substeps, 0), checks.segment(segment)
         origin = self.check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
@@ -244,7 +245,7 @@ class Solver:
         """
         if self.backend == "eager":
             return False
-        reason = self._not_native(state.device, self._has_tangents(state, *fields))
+        reason = self._not_native(state, *fields)
         if self.backend == "native":
             if reason is not None:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -268,16 +269,18 @@ class Solver:
 
     def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
-        tensors = tree.leaves((state, fields, self.constants))
-        return not transforming() and any(unpack_dual(tensor).tangent is not None for tensor in tensors)
+        tensors = (*vars(state).values(), *fields, *self.constants.values())
+        return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
 
-    def _not_native(self, device: torch.device, tangents: bool) -> str | None:
-        """Why the kernels cannot run a step on a device, or ``None`` if they can."""
+    def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
+        """Why the kernels cannot run a step, or ``None`` if they can."""
         if type(self).substep is not Solver.substep:
             return f"it does not call {type(self).__name__}.substep"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
+        if self._has_tangents(state, *fields):
+            return "it has no forward-mode derivatives"
+        return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
         """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked."""

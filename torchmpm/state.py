@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks, tree
-from torchmpm.native.cpu.library import leave_parent_threads
+from torchmpm.native.library import leave_parent_threads
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
@@ -161,6 +161,11 @@ class ParticleState:
         """
         return tree.where(mask, self, other)
 
+    def is_finite(self) -> Bool[Tensor, " B"]:
+        """Which simulations hold finite numbers only, (B,)."""
+        # Zero times a finite number is zero and zero times anything else is NaN, which the sum keeps.
+        return (self.stack().detach() * 0.0).sum((0, 2)) == 0.0
+
     def components(self) -> tuple[Tensor, ...]:
         """The 13 components, each (B, N): x, v, C and F row by row, Jp."""
         fields = (self.x, self.v, self.C.flatten(-2), self.F.flatten(-2))
@@ -171,7 +176,7 @@ class ParticleState:
         """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N), whose components stay contiguous."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
-        return cls(x, v, C, F, stacked[12])
+        return tree.unchecked(cls, x, v, C, F, stacked[12])
 
     def stack(self) -> Tensor:
         """The :meth:`components` as one tensor (13, B, N)."""

@@ -24,7 +24,7 @@ LARGEST_CACHE = 64
 def register(cls: type[Tree]) -> type[Tree]:
     """Class decorator that registers a dataclass as a pytree whose children are its fields.
 
-    Instances rebuilt from leaves skip ``__init__`` and its checks, because transforms such as ``torch.func.vmap`` put
+    Instances rebuilt from leaves are those of :func:`unchecked`, because transforms such as ``torch.func.vmap`` put
     leaves of other shapes in their place.
 
     Args:
@@ -35,14 +35,16 @@ def register(cls: type[Tree]) -> type[Tree]:
     def flatten(instance: Tree) -> tuple[list[Any], None]:
         return [getattr(instance, name) for name in names], None
 
-    def unflatten(children: Any, _: None) -> Tree:
-        instance = object.__new__(cls)
-        for name, child in zip(names, children, strict=True):
-            object.__setattr__(instance, name, child)
-        return instance
-
-    pytree.register_pytree_node(cls, flatten, unflatten)
+    pytree.register_pytree_node(cls, flatten, lambda children, _: unchecked(cls, *children))
     return cls
+
+
+def unchecked(cls: type[Tree], *values: Any) -> Tree:
+    """An instance of a dataclass from the values of its fields in order, without ``__init__`` and its checks."""
+    instance = object.__new__(cls)
+    for name, value in zip(cls.__dataclass_fields__, values, strict=True):  # type: ignore[attr-defined]
+        object.__setattr__(instance, name, value)
+    return instance
 
 
 def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:

@@ -101,7 +101,7 @@ def test_forward(per_substep, benchmark, minima, backend: str, size: str) -> Non
         def run() -> None:
             with torch.no_grad():
                 end = solver.step(state, actuation, substeps=SUBSTEPS, origin=origin)
-            assert torchmpm.diagnostics.finite(end).all()
+            assert end.is_finite().all()
 
     per_substep(run, particles=batch * count, substeps=SUBSTEPS, rounds=8)
     if benchmark.stats is not None:

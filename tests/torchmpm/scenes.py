@@ -1,8 +1,5 @@
 """Small scenes that several test files simulate."""
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -84,6 +81,12 @@ def robot_and_ball(robot_count: int, ball_count: int, **changes: object) -> Solv
     return robot(robot_count, bodies=(*robot(robot_count).bodies, ball), **changes)
 
 
+def combination(state: ParticleState, seed: int, **sizes: float) -> Tensor:
+    """A random combination of fields, each times a factor that brings them to one size, so that none drowns others."""
+    fields = enumerate((getattr(state, name), size) for name, size in sizes.items())
+    return sum(size * (normal(*t.shape, seed=seed + k).to(t) * t).sum() for k, (t, size) in fields)
+
+
 def assert_close(first: ParticleState, second: ParticleState, tolerance: float) -> None:
     """Compare all fields, relative to the largest number of each field."""
     for name in ("x", "v", "C", "F", "Jp"):
@@ -96,38 +99,3 @@ def assert_identical(first: ParticleState, second: ParticleState) -> None:
     """Compare all fields bit by bit."""
     for name in ("x", "v", "C", "F", "Jp"):
         assert torch.equal(getattr(first, name), getattr(second, name)), f"{name} differs"
-
-
-class Learned(torch.nn.Module):
-    """A law whose stiffness is a parameter of a module."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.mu = torch.nn.Parameter(torch.tensor([500.0], dtype=torch.float64))
-        self.register_buffer("scale", torch.ones(1, dtype=torch.float64))
-        self.lam = torch.tensor([50.0], dtype=torch.float64)
-
-    def law(self) -> Elastic:
-        return Elastic(self.mu * self.scale, self.lam)
-
-    def return_map(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().return_map(F, Jp)
-
-    def stress(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().stress(F, Jp)
-
-    def energy(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().energy(F, Jp)
-
-    def stiffness(self) -> Any:
-        return self.law().stiffness()
-
-
-@dataclass
-class Wrapped:
-    """A law that holds another one."""
-
-    base: Learned
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.base, name)

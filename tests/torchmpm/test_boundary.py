@@ -12,7 +12,7 @@ from scenes import normal
 from torch import Tensor
 
 from torchmpm import Grid, VelocityRule, fixed
-from torchmpm.boundary import constrain, faces, node_shift
+from torchmpm.boundary import constrain, faces
 from torchmpm.grid import PAD
 
 R = 8
@@ -104,8 +104,8 @@ def test_windows_at_whole_nodes(resolution: int, dtype: torch.dtype) -> None:
     """Although 1/96 and 1/100 are no binary numbers; between two nodes the shift is truncated."""
     grid, nodes = Grid(resolution), torch.arange(-300, 300)
     origin = (nodes.to(torch.float64) * grid.h).to(dtype)[:, None].expand(-1, 2)
-    assert torch.equal(node_shift(grid, origin), nodes[:, None].expand(-1, 2))
-    assert torch.equal(node_shift(grid, origin + 0.99 * grid.h)[300:], nodes[300:, None].expand(-1, 2))
+    assert torch.equal(grid.node_shift(origin), nodes[:, None].expand(-1, 2))
+    assert torch.equal(grid.node_shift(origin + 0.99 * grid.h)[300:], nodes[300:, None].expand(-1, 2))
 
 
 def test_each_simulation_has_its_origin() -> None:

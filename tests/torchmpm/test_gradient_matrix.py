@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import normal, positions, robot, turn
+from scenes import combination, normal, positions, robot, turn
 from torch import Tensor
 
 from torchmpm import Body, ParticleState, Snow, VonMises
@@ -52,8 +52,7 @@ def loss(given: dict[str, Tensor], substeps: int = 2) -> Tensor:
     solver = robot(COUNT, bodies=(body,), gravity=given["gravity"])
     start = ParticleState(given["x"], given["v"], given["C"], given["F"], torch.ones(1, COUNT, dtype=torch.float64))
     final = solver.step(start, given["actuation"], substeps=substeps)
-    parts = ((final.x, 100.0), (final.v, 1.0), (final.C, 0.05), (final.F, 1.0))
-    return sum(size * (normal(*t.shape, seed=10 + k) * t).sum() for k, (t, size) in enumerate(parts))
+    return combination(final, 10, x=100.0, v=1.0, C=0.05, F=1.0)
 
 
 def gradient(given: dict[str, Tensor], name: str, substeps: int = 2) -> Tensor:
@@ -132,8 +131,7 @@ def soil_loss(given: dict[str, Tensor]) -> Tensor:
     solver = robot(COUNT, bodies=(Body(COUNT, material, given["mass"]),), gravity=given["gravity"])
     start = ParticleState(given["x"], given["v"], given["C"], given["F"], given["Jp"])
     final = solver.step(start, substeps=2)
-    parts = ((final.x, 100.0), (final.v, 1.0), (final.C, 0.05), (final.F, 1.0), (final.Jp, 1.0))
-    return sum(size * (normal(*t.shape, seed=10 + k) * t).sum() for k, (t, size) in enumerate(parts))
+    return combination(final, 10, x=100.0, v=1.0, C=0.05, F=1.0, Jp=1.0)
 
 
 @pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "mu", "mass", "gravity"])

@@ -8,7 +8,7 @@ import torch
 from scenes import generator, matrix, normal, planes, turn
 from torch import Tensor
 
-from torchmpm import Elastic, VonMises, lame
+from torchmpm import Elastic, Snow, VonMises, lame
 from torchmpm.materials.elastic import corotated_stress
 from torchmpm.materials.von_mises import von_mises_return, yield_surface
 from torchmpm.substep import muscle_stress
@@ -213,16 +213,20 @@ def test_gradients_in_single_precision_at_large_strains() -> None:
     assert error.max() <= 1e-5
 
 
-def test_gradient_of_a_field_has_no_infinities() -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "material",
+    [VonMises(MU, LAM, YIELD), Snow(MU, LAM), Snow(MU, LAM, shear_cutoff=0.0)],
+    ids=["von Mises", "soil", "soil without cutoff"],
+)
+def test_gradient_of_a_field_has_no_infinities(material: Elastic, dtype: torch.dtype) -> None:
     """Also where branches that are not taken would divide by zero: F = 0, equal stretches, singular F."""
     singular = stretched(1.0, 0.0, 0.5, 0.2)
     F = torch.stack((torch.zeros(2, 2), torch.eye(2), turn(1.0), singular, -torch.eye(2), 1e-12 * turn(0.3)))[None]
-    for dtype in (torch.float32, torch.float64):
-        point = F.to(dtype).requires_grad_()
-        material, Jp = VonMises(MU, LAM, YIELD), point.new_ones(1, 6)
-        mapped, _ = material.return_map(planes(point), Jp)
-        total = torch.stack(material.stress(mapped, Jp)).sum() + matrix(mapped).sum()
-        assert torch.autograd.grad(total, point)[0].isfinite().all()
+    F = F.to(dtype).requires_grad_()
+    mapped, after = material.return_map(planes(F), F.new_ones(1, 6))
+    total = torch.stack(material.stress(mapped, F.new_ones(1, 6))).sum() + matrix(mapped).sum() + after.sum()
+    assert torch.autograd.grad(total, F)[0].isfinite().all()
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 40), (1, 40)])

@@ -6,13 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import lively, normal, robot
+from scenes import combination, lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, trajectory
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
-from torchmpm.native.cpu import call
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -70,10 +69,8 @@ def varied(count: int, given: Leaves) -> Solver:
 
 
 def loss(final: ParticleState) -> Tensor:
-    """A random combination of everything, brought to one size."""
-    sizes = {"x": 1.0, "v": 0.2, "C": 0.01, "F": 1.0, "Jp": 1.0}
-    fields = enumerate((getattr(final, name), size) for name, size in sizes.items())
-    return sum(size * (normal(*t.shape, seed=20 + k).to(t) * t).sum() for k, (t, size) in fields)
+    """A random combination of everything."""
+    return combination(final, 20, x=1.0, v=0.2, C=0.01, F=1.0, Jp=1.0)
 
 
 def gradients(
@@ -188,37 +185,28 @@ def test_threads_and_batch_make_no_difference() -> None:
         assert all(torch.equal(result[name], results[0][name]) for name in wanted)
 
 
-def test_checkpoints_of_a_trajectory() -> None:
-    """Steps nest in torchmpm.trajectory like those of the plain substep."""
-    state = lively(30)
-    fields = [(60.0 * normal(1, 2, 16, 16, seed=k)).requires_grad_() for k in range(3)]
-    results = []
-    for backend, checkpointed in (("eager", False), ("native", False), ("native", True)):
-        solver = robot(30, backend=backend)
-        final, _ = trajectory(
-            lambda s, a, solver=solver: solver.step(s, a, substeps=4),
-            state,
-            fields,
-            observe=lambda s: None,
-            checkpointed=checkpointed,
-        )
-        results.append(torch.autograd.grad(loss(final), fields))
-    for result in results[1:]:
-        for one, other in zip(result, results[0], strict=True):
-            torch.testing.assert_close(one, other, rtol=0, atol=1e-12 * other.abs().max().item())
-
-
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """To keep the tape within bounds; the gradients are the same."""
     given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
     whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
-    calls, step = [], kernels.native_step
-    monkeypatch.setattr(kernels, "native_step", lambda *arguments: calls.append(arguments[-1]) or step(*arguments))
+    calls, forward = [], kernels.forward
+    monkeypatch.setattr(kernels, "forward", lambda *arguments: calls.append(arguments[-1]) or forward(*arguments))
     limit = solvers(60, 2)["three bodies"].kernels.tape_limit(torch.empty(13, 2, 60).double())
-    monkeypatch.setattr(call, "KEPT_BYTES", 4 * call.KEPT_BYTES // limit)
+    monkeypatch.setattr(kernels, "KEPT_BYTES", 4 * kernels.KEPT_BYTES // limit)
     cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
     assert calls == [4, 4, 2]
     assert_gradients_close(cut, whole, 1e-14)
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's own: it takes row by row
+def test_a_whole_jacobian_at_once() -> None:
+    solver, state = robot(10, backend="native"), lively(10)
+
+    def centre(v: Tensor) -> Tensor:
+        return solver.step(replace(state, v=v), substeps=2).x.mean(1)[0]
+
+    rows, whole = (torch.autograd.functional.jacobian(centre, state.v, vectorize=v) for v in (False, True))
+    assert torch.equal(rows, whole) and whole.abs().max() > 0
 
 
 def test_second_derivatives_are_refused() -> None:
@@ -227,26 +215,3 @@ def test_second_derivatives_are_refused() -> None:
     (first,) = torch.autograd.grad(final.x.square().sum(), v, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(first.sum(), v)
-
-
-def operator_arguments() -> tuple[Solver, tuple[object, ...]]:
-    """A solver, and the arguments of the operator as its step passes them."""
-    seen, step = [], kernels.native_step
-    state, field, origin = moving(30, 2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "native_step", lambda *arguments: seen.append(arguments) or step(*arguments))
-        solver = replace(solvers(30, 2)["tensor values"], backend="native")
-        solver.step(state, field, substeps=2, origin=origin)
-    (arguments,) = seen
-    return solver, arguments
-
-
-def test_operator_keeps_the_rules_of_torch() -> None:
-    """Schema, fake tensors, and autograd, as torch.library.opcheck knows them."""
-    solver, given = operator_arguments()
-    assert given[-2] == solver.kernels.tables.handle
-    arguments = [
-        a.clone().requires_grad_() if isinstance(a, Tensor) and k in (0, 1, 4) else a for k, a in enumerate(given)
-    ]
-    tests = ("test_schema", "test_autograd_registration", "test_faketensor")
-    torch.library.opcheck(kernels.native_step, tuple(arguments), test_utils=tests)

@@ -1,23 +1,20 @@
 """Compiling the kernels: once per machine, safely, and with clear words where it cannot be done."""
 
 import ctypes
-import gc
 import os
+import runpy
 import stat
-import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from scenes import lively, robot
+from scenes import assert_identical, lively, robot
 
 from torchmpm.backends import compiler_found
-from torchmpm.native.cpu import compiler, library
-from torchmpm.native.tables import tables_of
+from torchmpm.native import library
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +28,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 def forget() -> None:
     """As in the next process."""
-    library._load.cache_clear()
+    library._compiled.cache_clear()
     library.build.cache_clear()
 
 
@@ -128,8 +125,8 @@ def test_another_processor_or_option_is_another_file(
     quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     library.load(torch.float32)
-    for module, name, value in ((library, "processor", lambda: "another processor"), (compiler, "_FLAGS", ("-O0",))):
-        monkeypatch.setattr(module, name, value)
+    for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
+        monkeypatch.setattr(library, name, value)
         forget()
         library.load(torch.float32)
     assert runs(tmp_path) == 3
@@ -153,7 +150,7 @@ def test_kernels_of_the_package_come_first(
     source = tmp_path / "package" / "some.cpp"
     source.parent.mkdir()
     source.write_text("// nothing")
-    path = compiler.compiled_path(source, ["-DA"], str(library.family()))
+    path = library.compiled_path(source, ["-DA"], str(library.family()))
     path.write_bytes(b"of another system")
     library.build(source, "-DA")
     assert runs(tmp_path) == 1
@@ -168,41 +165,29 @@ def test_kernels_of_the_package_come_first(
     assert library.packaged(source, "-DA") is None
 
 
-def test_windows() -> None:
+def test_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """There the package imports and runs on the eager backend; the native one says what it needs."""
-    program = (
-        "import os, sys, torch, jaxtyping; del os.register_at_fork, os.uname; sys.platform = 'win32'\n"
-        "import torchmpm; body = torchmpm.Body(1, torchmpm.Elastic(1.0, 1.0), mass=1.0)\n"
-        "state = torchmpm.ParticleState.at_rest(torch.full((1, 2), 0.5))\n"
-        "print(torchmpm.Solver(torchmpm.Grid(128), bodies=(body,), gravity=(0, -9)).step(state).v[0, 0].tolist())\n"
-        "torchmpm.Solver(torchmpm.Grid(128), bodies=(body,), backend='native')"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.stdout.startswith("[0.0, -0.0008999"), done.stderr
-    assert done.stderr.endswith("backend 'native' does not run on Windows, except in WSL: use 'eager'\n"), done.stderr
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(os, "register_at_fork")
+    monkeypatch.delattr(os, "uname")
+    there = runpy.run_path(library.__file__)
+    assert there["find_compiler"]() is None and there["NO_COMPILER"].startswith("does not run on Windows")
+    monkeypatch.setattr(library, "family", lambda: None)
+    assert_identical(*(robot(5, backend=name).step(lively(5)) for name in ("auto", "eager")))
+    with pytest.raises(ValueError, match="backend 'native'"):
+        robot(5, backend="native")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_a_forked_process_that_does_not_simulate_keeps_its_threads() -> None:
-    """One that does has a single thread, see ``tests/dittogym/test_concurrency.py``."""
-    program = (
-        "import os, torch, torchmpm\ntorch.set_num_threads(3)\nif not (child := os.fork()):\n"
-        "    before = torch.get_num_threads(); torchmpm.sampling.sobol(9, 0)\n"
-        "    os._exit(10 * before + torch.get_num_threads())\nprint(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.stdout == "31\n", done.stderr
-
-
-def test_tables_live_as_long_as_their_solvers_and_graphs() -> None:
-    solver, state = robot(5, backend="native", dt=7e-5), lively(5)
-    handle, v = solver.kernels.tables.handle, state.v.clone().requires_grad_()
-    final = solver.step(replace(state, v=v))
-    del solver
-    gc.collect()
-    assert tables_of(handle).dt == 7e-5
-    final.x.sum().backward()
-    del final
-    gc.collect()
-    with pytest.raises(KeyError):
-        tables_of(handle)
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
+def test_a_forked_process_keeps_its_threads_until_it_simulates() -> None:
+    """Then it has a single thread, see ``tests/dittogym/test_concurrency.py``."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    child = os.fork()
+    if not child:
+        before = torch.get_num_threads()
+        library.leave_parent_threads()
+        os._exit(10 * before + torch.get_num_threads())
+    torch.set_num_threads(threads)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 31

@@ -102,58 +102,39 @@ def test_momentum_changes_by_the_impulses(case: Case) -> None:
     assert torch.equal(diagnostics.mass(solver, after), diagnostics.mass(solver, case.state))
 
 
-def transformed(case: Case, Q: Tensor, rules: tuple[VelocityRule, ...], field: Tensor) -> Case:
-    """The scene under an orthogonal map of space about the middle of the nodes; material axes go along."""
-    gravity = tuple((Q @ torch.tensor(case.solver.gravity, dtype=torch.float64)).tolist())
-    solver = replace(case.solver, gravity=gravity, rules=rules)
-    return Case(solver, image(case, case.state, Q), field, case.origin)
-
-
-def image(case: Case, state: ParticleState, Q: Tensor) -> ParticleState:
-    """A state under the same map."""
+def mapped(case: Case, state: ParticleState, Q: Tensor) -> ParticleState:
+    """A state under an orthogonal map of space about the middle of the nodes."""
     grid = case.solver.grid
     middle = case.origin[:, None] + 0.5 * (grid.resolution - 1) * grid.h
     x, v = middle + (state.x - middle) @ Q.T, state.v @ Q.T
     return ParticleState(x, v, Q @ state.C @ Q.T, Q @ state.F @ Q.T, state.Jp)
 
 
-def nodes(rule: VelocityRule, last: int, swap: bool, flip_i: bool) -> dict[str, tuple[int | None, int | None]]:
-    """Ranges of a rule after nodes (i, j) became (j, i) if ``swap``, and then (last - i, j) if ``flip_i``."""
-    i, j = (rule.j, rule.i) if swap else (rule.i, rule.j)
-    if flip_i:
-        i = tuple(None if end is None else last - end for end in reversed(i))
-    return {"i": i, "j": j}
+#: Maps of space, of the directions of rules, and of the actuation, as material axes go along: those of a quarter turn
+#: to the left change places.
+MAPS = {
+    "quarter turn": (((0.0, -1.0), (1.0, 0.0)), "+y -y -x +x", lambda field: torch.rot90(field, 1, (2, 3)).flip(1)),
+    "mirror": (((-1.0, 0.0), (0.0, 1.0)), "-x +x +y -y", lambda field: field.flip(2)),
+}
 
 
-QUARTER = torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
-MIRROR = torch.tensor([[-1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
-
-
+@pytest.mark.parametrize("name", MAPS)
 @settings(max_examples=20)
-@given(cases())
-def test_a_quarter_turn(case: Case) -> None:
-    """Everything turns to the left, material axes too, so the muscles' two actuations change places."""
-    last = case.solver.grid.resolution - 1
-    directions = {"+x": "+y", "+y": "-x", "-x": "-y", "-y": "+x"}
-    rules = tuple(
-        replace(rule, direction=directions[rule.direction], **nodes(rule, last, swap=True, flip_i=True))
-        for rule in case.solver.rules
-    )
-    field = torch.rot90(case.actuation, 1, (2, 3)).flip(1)
-    assert_close(transformed(case, QUARTER, rules, field).run(), image(case, case.run(), QUARTER), 1e-9)
-
-
-@settings(max_examples=20)
-@given(cases())
-def test_a_mirror(case: Case) -> None:
-    """Left becomes right; the muscles act along the same axes."""
-    last = case.solver.grid.resolution - 1
-    directions = {"+x": "-x", "-x": "+x", "+y": "+y", "-y": "-y"}
-    rules = tuple(
-        replace(rule, direction=directions[rule.direction], **nodes(rule, last, swap=False, flip_i=True))
-        for rule in case.solver.rules
-    )
-    assert_close(transformed(case, MIRROR, rules, case.actuation.flip(2)).run(), image(case, case.run(), MIRROR), 1e-9)
+@given(case=cases())
+def test_a_map_of_space(name: str, case: Case) -> None:
+    """What happens there is what happens here, turned or mirrored."""
+    matrix, directions, turned = MAPS[name]
+    Q, solver = torch.tensor(matrix, dtype=torch.float64), case.solver
+    direction = dict(zip(("+x", "-x", "+y", "-y"), directions.split(), strict=True))
+    rules = []
+    for rule in solver.rules:  # nodes (i, j) become (last - j, i), or (last - i, j)
+        i, j = (rule.j, rule.i) if name == "quarter turn" else (rule.i, rule.j)
+        i = tuple(None if end is None else solver.grid.resolution - 1 - end for end in reversed(i))
+        rules.append(replace(rule, direction=direction[rule.direction], i=i, j=j))
+    gravity = tuple((Q @ torch.tensor(solver.gravity, dtype=torch.float64)).tolist())
+    there = replace(solver, gravity=gravity, rules=tuple(rules))
+    found = Case(there, mapped(case, case.state, Q), turned(case.actuation), case.origin).run()
+    assert_close(found, mapped(case, case.run(), Q), 1e-9)
 
 
 @settings(max_examples=15)

@@ -50,16 +50,6 @@ def test_shear_cutoff_forgets_small_shear_only() -> None:
     assert matrix(soil(shear_cutoff=0.0).return_map(planes(small), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(0.9e-5)
 
 
-def test_a_grain_pulled_apart_for_ever_stays_finite() -> None:
-    F = (2.0 * torch.eye(2))[None, None].requires_grad_()
-    Jp = torch.ones(1, 1)
-    for _ in range(200):
-        Jp = soil().return_map(planes(F), Jp)[1]
-    assert Jp.item() == pytest.approx(1e30)
-    total = torch.stack(soil().stress(soil().return_map(planes(F), Jp)[0], Jp)).sum() + 0.0 * Jp.sum()
-    assert torch.autograd.grad(total, F)[0].isfinite().all()
-
-
 @pytest.mark.parametrize(("Jp", "factor"), [(1.0, 1.0), (0.9, math.e), (0.5, 5.0), (1.1, 1 / math.e), (2.0, 0.1)])
 def test_hardening(Jp: float, factor: float) -> None:
     F = deformations(10, LOW, HIGH, seed=5, share_inverted=0.0)
@@ -101,18 +91,6 @@ def test_gradients_against_finite_differences(name: str) -> None:
     assert torch.autograd.gradcheck(all_of_it, (F, Jp, mu.requires_grad_()), eps=1e-8, atol=1e-7, rtol=1e-6)
 
 
-@pytest.mark.parametrize("cutoff", [0.0, 1e-5])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradient_of_a_field_has_no_infinities(dtype: torch.dtype, cutoff: float) -> None:
-    singular = stretched(1.0, 0.0, 0.5, 0.2)
-    F = torch.stack((torch.zeros(2, 2), torch.eye(2), turn(1.0), singular, -torch.eye(2), 1e-12 * turn(0.3)))[None]
-    F = F.to(dtype).requires_grad_()
-    Jp = F.new_ones(1, 6)
-    mapped, after = soil(shear_cutoff=cutoff).return_map(planes(F), Jp)
-    total = torch.stack(soil().stress(mapped, Jp)).sum() + matrix(mapped).sum() + after.sum()
-    assert torch.autograd.grad(total, F)[0].isfinite().all()
-
-
 def test_steep_hardening_has_derivatives() -> None:
     """Where the factor is at its bound its exponential overflows: the derivative there is zero, not no number."""
     for Jp, at_bound in ((0.05, True), (1.5, True), (0.99, False)):
@@ -137,9 +115,3 @@ def test_return_map_between_the_bounds_is_the_identity_in_single_precision_too(c
         slopes = torch.autograd.grad(returned[0].sum(), F)
         torch.testing.assert_close(torch.cat(slopes, 1), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), atol=1e-6, rtol=0)
     torch.testing.assert_close(torch.cat(returned, 1), torch.cat(F, 1), atol=2e-7, rtol=0)
-
-
-def test_no_derivative_in_Jp_without_hardening() -> None:
-    Jp = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
-    xx, *_ = soil(hardening_range=(1.0, 1.0)).stress(planes(1.1 * torch.eye(2, dtype=torch.float64)[None, None]), Jp)
-    assert xx.item() != 0 and torch.autograd.grad(xx.sum(), Jp)[0].item() == 0

@@ -1,10 +1,12 @@
-"""The kernels of a solver: whether they can run, a step through them, and the operators of torch that it calls."""
+"""The kernels of a solver: whether they can run, a step through them with its derivative, and the call into C++."""
 
+import ctypes
 import functools
 import importlib.util
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,28 +14,22 @@ import torch
 from torch import Tensor
 
 from torchmpm import tree
-from torchmpm.boundary import VelocityRule, node_shift
+from torchmpm.boundary import VelocityRule
+from torchmpm.checks import Segment
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
-from torchmpm.native.cpu import call
-from torchmpm.native.tables import (
-    KINDS,
-    Cotangents,
-    Inputs,
-    Tables,
-    bodies_of,
-    make_tables,
-    make_values,
-    tables_of,
-    upload,
-)
-from torchmpm.rollout import Segment
+from torchmpm.native.library import POOL, load, thread_pool
+from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
 from torchmpm.state import ParticleState
 
 #: A node remembers its rule for each direction in one byte, in which 0 stands for none.
 MAX_RULES = 255
 #: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
+#: Scratch memory of the CPU up to this size, bytes, is kept for the next call, as fresh pages cost a third of a
+#: backward pass. It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps
+#: are cut. Simulations that run at the same time share it.
+KEPT_BYTES = 2**28
 #: The tape on CUDA takes no more than this, bytes.
 CUDA_TAPE_BYTES = 2**31
 
@@ -80,7 +76,7 @@ class Kernels:
 
     @functools.cached_property
     def tables(self) -> Tables:
-        """All but the values, see :func:`torchmpm.native.tables.make_tables`."""
+        """All of the solver but the values of its materials."""
         return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     def values(self, like: Tensor) -> Tensor:
@@ -90,7 +86,7 @@ class Kernels:
             return self._kept[key]
         values = make_values(self.bodies, self.dt, self.grid.h, like)
         numbers = not any(isinstance(v, Tensor) for body in self.bodies for v in body.constants().values())
-        if numbers and type(values) is Tensor:  # fake tensors of a trace must not be kept
+        if numbers:
             with torch.inference_mode(False):  # a tensor made in inference mode could not serve gradients later
                 self._kept[key] = values = values.clone()
         return values
@@ -105,21 +101,17 @@ class Kernels:
         segment: Segment = "auto",
     ) -> ParticleState:
         """Advance a state (B, N) whose arguments were checked; see :meth:`torchmpm.Solver.step`."""
-        origin = origin.contiguous()
-        actuation = None if actuation is None else actuation.contiguous()
         given = gravity if isinstance(gravity, Tensor) else upload(tuple(gravity), state.dtype, state.device)
-        gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
-        values, shift = self.values(state.Jp), node_shift(self.grid, origin)
-        components = state.stack()
-        if torch.is_grad_enabled():
-            tensors = components, actuation, origin, gravity, values, shift
-            components, actuation, origin, gravity, values, shift = tree.without_inference(tensors)
-        # With gradients a call keeps its start and needs a tape of all its substeps later, whose size must be bounded.
-        limit = self.tape_limit(components, segment) if torch.is_grad_enabled() else substeps
+        gravity = given.to(state.Jp).expand(state.batch_size, 2)
+        values, shift = self.values(state.Jp), self.grid.node_shift(origin)
+        inputs = tree.map(Tensor.contiguous, Inputs(state.stack(), actuation, origin, gravity, values, shift))
+        limit = substeps
+        if torch.is_grad_enabled():  # a piece keeps its start, and needs a tape of all its substeps later
+            inputs, limit = tree.without_inference(inputs), self.tape_limit(inputs.components, segment)
         for start in range(0, substeps, limit):
-            length = min(limit, substeps - start)
-            components = native_step(components, actuation, origin, gravity, values, shift, self.tables.handle, length)
-        return ParticleState.from_stack(components)
+            components = Step.apply(self.tables, min(limit, substeps - start), *inputs[:6])
+            inputs = inputs._replace(components=components)
+        return ParticleState.from_stack(inputs.components)
 
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
@@ -128,7 +120,7 @@ class Kernels:
         else:
             rows, batch, particles = components.shape
             substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
-            limit = call.KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
+            limit = KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
 
 
@@ -142,94 +134,139 @@ def triton_missing(compiler: str | None, path: str | None) -> str | None:
     return None
 
 
-_INPUTS = "Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
-_NUMBERS = "int handle, int substeps"
+class Step(torch.autograd.Function):
+    """Some substeps. Autograd keeps their start; the backward pass replays them onto a tape, then goes back."""
+
+    @staticmethod
+    def forward(ctx: Any, tables: Tables, substeps: int, *tensors: Any) -> Tensor:
+        """New components (13, B, N), from the tensors of :class:`Inputs`."""
+        ctx.tables, ctx.substeps = tables, substeps
+        ctx.save_for_backward(*tensors)
+        return forward(Inputs(*tensors), tables, substeps)
+
+    @staticmethod
+    def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
+        """Derivatives in the tensors of :class:`Inputs` from that in the new components."""
+        tensors, (_, wants_field, _, _, wants_values) = ctx.saved_tensors, ctx.needs_input_grad[2:7]
+        tables = ctypes.addressof(ctx.tables)
+        found = adjoint(*tensors, result_bar, tables, ctx.substeps, wants_field, wants_values)
+        *bars, values_bar = (bar if bar.numel() else None for bar in found)
+        if values_bar is not None:
+            values_bar = _sum_shared(values_bar, tensors[4], ctx.tables)
+        return None, None, *bars, values_bar, None
 
 
-@torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
-def native_step(*arguments: Any) -> Tensor:
-    """Components (13, B, N) after some substeps, from the tensors of Inputs, the handle of Tables, and their number."""
-    *tensors, handle, substeps = arguments
-    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
-    result = torch.empty_like(inputs.components)
-    call.run(inputs, handle, substeps, result=result)
-    return result
-
-
+# An operator, so that torch can take it row by row where a whole Jacobian is asked for (``is_grads_batched=True``).
 @torch.library.custom_op(
-    "torchmpm::native_step_backward",
+    "torchmpm::adjoint",
     mutates_args=(),
     schema=(
-        f"({_INPUTS}, Tensor result_bar, {_NUMBERS}, bool wants_field, bool wants_values) "
+        "(Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift, "
+        "Tensor result_bar, int tables, int substeps, bool wants_field, bool wants_values) "
         "-> (Tensor, Tensor, Tensor, Tensor, Tensor)"
     ),
 )
-def native_step_backward(*arguments: Any) -> Cotangents:
-    """Replay the substeps, then go back.
-
-    The arguments are tensors, handle, substeps, and whether to compute derivatives in the field and in the values.
-    """
-    *tensors, handle, substeps, wants_field, wants_values = arguments
+def adjoint(*arguments: Any) -> tuple[Tensor, ...]:
+    """The derivative of :class:`Step`, from :class:`Inputs` and the address of :class:`Tables`."""
+    *tensors, tables, substeps, wants_field, wants_values = arguments
     inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
-    cotangents = inputs.empty_cotangents(wants_field, wants_values)
-    wanted = {n: bar for n, bar in zip(call.COTANGENTS, cotangents, strict=True) if bar.numel()}
-    call.run(inputs, handle, substeps, **wanted)
-    return cotangents
-
-
-@native_step.register_kernel("cuda")
-def _(*arguments: Any) -> Tensor:
-    from torchmpm.native import cuda  # not at the top: it imports Triton
-
-    return cuda.forward(*arguments)
-
-
-@native_step_backward.register_kernel("cuda")
-def _(*arguments: Any) -> Cotangents:
-    from torchmpm.native import cuda
-
-    return cuda.backward(*arguments)
-
-
-@native_step.register_fake
-def _(components: Tensor, *_: object) -> Tensor:
-    return torch.empty_like(components, memory_format=torch.contiguous_format)
-
-
-@native_step_backward.register_fake
-def _(*arguments: Any) -> Cotangents:
-    *tensors, _handle, _substeps, wants_field, wants_values = arguments
-    return Inputs(*tensors).empty_cotangents(wants_field, wants_values)
-
-
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, ctx.handle, ctx.substeps = inputs
-    ctx.tables = tables_of(ctx.handle)  # the solver may be gone when the backward pass needs them
-    ctx.save_for_backward(*tensors)
-
-
-def _backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
-    saved, wanted = ctx.saved_tensors, ctx.needs_input_grad[:5]
-    wants_field, wants_values = wanted[1], wanted[4]
-    *found, values_bar = native_step_backward(*saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values)
-    found.append(_sum_shared(values_bar, saved[4], ctx.handle) if wants_values else None)
-    return (*(bar if wants else None for bar, wants in zip(found, wanted, strict=True)), None, None, None)
-
-
-def _sum_shared(bar: Tensor, values: Tensor, handle: int) -> Tensor:
-    """Sum derivatives per particle (8, B, N) over the particles and simulations that share a value."""
-    if values.shape[1] == 1:
-        bar = bar.sum(1, keepdim=True)
-    columns = []
-    for body in bodies_of(handle):
-        part = bar[:, :, body.first : body.first + body.count]
-        columns.append(part if body.varying else part.sum(2, keepdim=True))
-    return torch.cat(columns, dim=2)
+    return backward(inputs, Tables.from_address(tables), substeps, wants_field, wants_values)
 
 
 def _no_second_derivative(ctx: Any, *_: Tensor) -> None:
     raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
 
 
-native_step.register_autograd(_backward, setup_context=_setup_context)
-native_step_backward.register_autograd(_no_second_derivative)
+adjoint.register_autograd(_no_second_derivative)
+
+
+def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
+    """Components (13, B, N) after some substeps."""
+    if inputs.components.is_cuda:
+        from torchmpm.native import cuda  # not at the top: it imports Triton
+
+        return cuda.forward(inputs, tables, substeps)
+    result = torch.empty_like(inputs.components)
+    call("torchmpm_forward", inputs, tables, substeps, result=result)
+    return result
+
+
+def backward(
+    inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool
+) -> tuple[Tensor, ...]:
+    """Replay the substeps, then go back; derivatives as :meth:`Inputs.empty_cotangents` lists them."""
+    if inputs.components.is_cuda:
+        from torchmpm.native import cuda
+
+        return cuda.backward(inputs, tables, substeps, wants_field, wants_values)
+    bars = inputs.empty_cotangents(wants_field, wants_values)
+    wanted = {name: bar for name, bar in zip(COTANGENTS, bars, strict=True) if bar.numel()}
+    call("torchmpm_backward", inputs, tables, substeps, **wanted)
+    return bars
+
+
+def _sum_shared(bar: Tensor, values: Tensor, tables: Tables) -> Tensor:
+    """Sum derivatives per particle (8, B, N) over the particles and simulations that share a value."""
+    if values.shape[1] == 1:
+        bar = bar.sum(1, keepdim=True)
+    columns = []
+    for body in tables.bodies[: tables.num_bodies]:
+        part = bar[:, :, body.first : body.first + body.count]
+        columns.append(part if body.varying else part.sum(2, keepdim=True))
+    return torch.cat(columns, dim=2)
+
+
+#: Derivatives that the adjoint in C++ writes.
+COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
+
+
+class Call(ctypes.Structure):
+    """The arguments of a call into C++, as ``struct Call`` in ``scene.hpp``."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("batch", "particles", "substeps", "threads")),
+        *((name, ctypes.c_void_p) for name in POOL),
+        ("tables", ctypes.POINTER(Tables)),
+        *((name, ctypes.c_void_p) for name in ("components", "field", "origin", "shift", "gravity", "values")),
+        *((name, ctypes.c_int64) for name in ("values_batch", "columns")),
+        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *COTANGENTS)),
+    ]
+
+
+def call(name: str, inputs: Inputs, tables: Tables, substeps: int, **outputs: Tensor) -> None:
+    """Call a function of ``native.cpp``, which writes the ``outputs``."""
+    library, (_, batch, particles) = load(inputs.components.dtype), inputs.components.shape
+    arguments = Call(
+        batch=batch,
+        particles=particles,
+        substeps=substeps,
+        threads=torch.get_num_threads(),
+        tables=ctypes.pointer(tables),
+        values_batch=inputs.values.shape[1],
+        columns=inputs.values.shape[2],
+        **thread_pool(),
+        **{name: tensor.data_ptr() for name, tensor in (inputs._asdict() | outputs).items() if tensor is not None},
+    )
+    function, measure = getattr(library, name), getattr(library, f"{name}_bytes")
+    measure.restype = ctypes.c_size_t
+    with _scratch(measure(ctypes.byref(arguments))) as scratch:
+        if function(ctypes.byref(arguments), ctypes.c_void_p(scratch)):
+            raise MemoryError("backend 'native' ran out of memory")
+
+
+_kept: list[Tensor] = []
+
+
+@contextmanager
+def _scratch(size: int) -> Iterator[int]:
+    """Address of ``size`` bytes of aligned memory."""
+    try:
+        buffer = _kept.pop()
+    except IndexError:
+        buffer = torch.empty(0, dtype=torch.uint8, device="cpu")
+    if buffer.numel() < size + 64:
+        del buffer
+        buffer = torch.empty(size + 64, dtype=torch.uint8, device="cpu")
+    yield (buffer.data_ptr() + 63) // 64 * 64
+    if buffer.numel() <= KEPT_BYTES and not _kept:
+        _kept.append(buffer)

@@ -1,11 +1,9 @@
-"""Inputs of the kernels: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
+"""What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 import ctypes
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
-from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor
@@ -60,12 +58,7 @@ class RuleTable(ctypes.Structure):
 
 
 class Tables(ctypes.Structure):
-    """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``).
-
-    Operators of torch, which take numbers and tensors, know it by its ``handle``, for :func:`tables_of`.
-    """
-
-    handle: int
+    """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``)."""
 
     _fields_ = [
         *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
@@ -75,13 +68,8 @@ class Tables(ctypes.Structure):
     ]
 
 
-#: Derivatives in components, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
-#: particle. Those that are not wanted are empty.
-Cotangents = tuple[Tensor, ...]
-
-
 class Inputs(NamedTuple):
-    """Tensors of a call, a tree for ``torchmpm.tree``."""
+    """Tensors of a call, all contiguous; a tree for ``torchmpm.tree``."""
 
     components: Tensor  # (13, B, N) components of the state, see ParticleState.components
     field: Tensor | None  # (B, 2, G, G) muscle actuation on the nodes, Pa
@@ -91,50 +79,29 @@ class Inputs(NamedTuple):
     shift: Tensor  # (B, 2) int64, nodes between the world's origin and the window's
     result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new components, for the adjoint
 
-    def empty_cotangents(self, wants_field: bool, wants_values: bool) -> Cotangents:
-        """Room for the derivatives."""
-        nothing = self.components.new_empty(0)
+    def empty_cotangents(self, wants_field: bool, wants_values: bool) -> tuple[Tensor, ...]:
+        """Room for derivatives in components, field, origin and gravity, in their shapes, and in the values.
+
+        The last has the shape (8, B, N), a column for each particle. Those that are not wanted are empty.
+        """
+        components, field = self.components, self.field
         return (
-            torch.empty_like(self.components, memory_format=torch.contiguous_format),
-            torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
+            torch.empty_like(components),
+            components.new_empty(field.shape if wants_field and field is not None else 0),
             torch.empty_like(self.origin),
             torch.empty_like(self.gravity),
-            self.components.new_empty(VALUES, *self.components.shape[1:]) if wants_values else nothing.clone(),
+            components.new_empty((VALUES, *components.shape[1:]) if wants_values else 0),
         )
 
 
-#: Tables by their contents and by their handles, for as long as a solver or a graph uses them.
-_by_content: WeakValueDictionary[bytes, Tables] = WeakValueDictionary()
-_by_handle: WeakValueDictionary[int, Tables] = WeakValueDictionary()
-_next_handle = itertools.count()
-
-
 def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> Tables:
-    """Describe a solver to the kernels; equal solvers share their tables."""
+    """Describe a solver to the kernels."""
     directions = list(dict.fromkeys(rule.direction for rule in rules))
     rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
     body_tables = (BodyTable * len(bodies))(*_body_tables(bodies, dt))
     sizes = (grid.resolution, len(bodies), len(rules))
     numbers = (grid.h, dt, grid.margin, grid.extent, damping, MASS_EPSILON, STRETCH_FLOOR)
-    content = bytes(Tables(*sizes, *numbers)) + bytes(body_tables) + bytes(rule_tables)
-    tables = _by_content.get(content)
-    if tables is None:  # another thread may do the same at this moment, with a handle of its own
-        tables = Tables(*sizes, *numbers, body_tables, rule_tables)
-        tables.handle = next(_next_handle)
-        _by_handle[tables.handle] = tables
-        tables = _by_content.setdefault(content, tables)
-    return tables
-
-
-def tables_of(handle: int) -> Tables:
-    """The tables that a handle stands for in this process."""
-    return _by_handle[handle]
-
-
-def bodies_of(handle: int) -> list[BodyTable]:
-    """The bodies among the tables of a handle."""
-    tables = tables_of(handle)
-    return tables.bodies[: tables.num_bodies]
+    return Tables(*sizes, *numbers, body_tables, rule_tables)
 
 
 def _body_tables(bodies: Sequence[Body], dt: float) -> Iterator[BodyTable]:

@@ -1,4 +1,4 @@
-"""The kernels in Triton, for tensors on CUDA; the operators of :mod:`torchmpm.native.kernels` there.
+"""The kernels in Triton, for tensors on CUDA; what :mod:`torchmpm.native.kernels` calls there.
 
 ``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels,
 in the order in which they build on each other: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the
@@ -9,41 +9,35 @@ adds mass and momentum to the nodes for the next substep, and one over the nodes
 in no fixed order: results differ from call to call in their last bits.
 """
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from torchmpm import tree
 from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
 from torchmpm.native.cuda.programs import Backward, Forward, Program
 from torchmpm.native.cuda.tables import device_tables
-from torchmpm.native.tables import Inputs
+from torchmpm.native.tables import Inputs, Tables
 
 __all__ = ["backward", "cache", "forward"]
 
 
-def forward(*arguments: Any) -> Tensor:
-    """Advance all simulations; see :func:`torchmpm.native.kernels.native_step`."""
-    *tensors, handle, substeps = arguments
-    (result,) = _run(Forward, Inputs(*tensors), handle, substeps)
+def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
+    """Advance all simulations; see :func:`torchmpm.native.kernels.forward`."""
+    (result,) = _run(Forward, inputs, tables, substeps)
     return result
 
 
-def backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """Adjoint of :func:`forward`; see :func:`torchmpm.native.kernels.native_step_backward`."""
-    *tensors, handle, substeps, wants_field, wants_values = arguments
-    return _run(Backward, Inputs(*tensors), handle, substeps, wants_field, wants_values)
+def backward(inputs: Inputs, tables: Tables, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
+    """Adjoint of :func:`forward`; see :func:`torchmpm.native.kernels.backward`."""
+    return _run(Backward, inputs, tables, substeps, *wants)
 
 
-def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
+def _run(kind: type[Program], inputs: Inputs, tables: Tables, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
     """Run a program, from a graph where that works: not while the caller records a graph of their own."""
-    inputs = tree.map(Tensor.contiguous, inputs)
     planes = inputs.components
-    tables = device_tables(handle, planes.dtype, planes.device)
+    constants = device_tables(tables, planes.dtype, planes.device)
 
     def build(own: Inputs) -> Program:
-        return kind(own, tables, substeps, *wants)
+        return kind(own, constants, substeps, *wants)
 
     if planes.device.type != "cuda":
         return build(inputs).run()
@@ -54,4 +48,4 @@ def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants
         # Two streams may run at once, so each has buffers of its own.
         stream = torch.cuda.current_stream().cuda_stream
         most = KEPT_SHARE * torch.cuda.get_device_properties(planes.device).total_memory
-        return cache.run((kind, handle, substeps, wants, shapes, stream), build, inputs, most)
+        return cache.run((kind, tables, substeps, wants, shapes, stream), build, inputs, most)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.materials.snow import LARGEST_JP
-from torchmpm.native.tables import BodyTable, Tables, bodies_of, tables_of
+from torchmpm.native.tables import BodyTable, Tables
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class DeviceTables:
 
 
 @functools.lru_cache(maxsize=64)
-def device_tables(handle: int, dtype: torch.dtype, device: torch.device) -> DeviceTables:
-    """The tables of a handle on a device; kept, because a copy to a device waits for it."""
-    tables, bodies = tables_of(handle), bodies_of(handle)
+def device_tables(tables: Tables, dtype: torch.dtype, device: torch.device) -> DeviceTables:
+    """The tables of a solver on a device; kept, because a copy to a device waits for it."""
+    bodies = tables.bodies[: tables.num_bodies]
     rules = tables.rules[: tables.num_rules]
     constants = [tables.h, 1.0 / tables.h, tables.dt, tables.margin, tables.extent, tables.damping, tables.mass_epsilon]
     constants += [tables.stretch_floor, LARGEST_JP]
