@@ -27,6 +27,15 @@ ROOT = DOCS.parent
 OBSERVES = ("image", "state", "simulator", "nothing")
 BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -->)")
 WAYS = {"+x": "right", "-x": "left", "+y": "up", "-y": "down"}
+#: Where algorithms say what they log.
+METRICS = {
+    "`cfp-analytic`": ("cfp.analytic.learner.METRICS",),
+    "`cfp-sac`": ("cfp.sac.learner.ROLLOUT_METRICS", "cfp.sac.algorithm.METRICS"),
+    "`shac`": ("baselines.shac.METRICS",),
+    "`distill`": ("baselines.distillation.learner.METRICS",),
+    "`gradient`": ("baselines.trajectory.METRICS",),
+    "`mpc`, `cem`": ("baselines.planning.mpc.METRICS",),
+}
 Row = dict[str, str]
 
 
@@ -222,10 +231,41 @@ def from_csv(name: str) -> str:
     return markdown(list(rows[0]), (list(row.values()) for row in rows))
 
 
+def verification() -> str:
+    """Errors of the solver, with a row for each problem."""
+    problems: dict[str, list[Row]] = {}
+    for row in read("verification.csv"):
+        problems.setdefault(row["problem"], []).append(row)
+
+    def listed(rows: list[Row], column: str) -> str:
+        return ", ".join(row[column] for row in rows if row[column])
+
+    def sizes(rows: list[Row]) -> str:
+        return f"{', '.join(row['size'].split()[0] for row in rows)} {rows[0]['size'].partition(' ')[2]}"
+
+    return markdown(
+        ("Problem", "Sizes", "Errors", "Orders"),
+        ([name, sizes(rows), listed(rows, "error"), listed(rows, "order")] for name, rows in problems.items()),
+    )
+
+
 def names(*paths: str) -> str:
     """Names and their meanings, from dictionaries ``package.module.NAME``."""
     found = {key: meaning for path in paths for key, meaning in pkgutil.resolve_name(path).items()}
     return markdown(("Name", "Meaning"), ([f"`{key}`", meaning] for key, meaning in found.items()))
+
+
+def metrics() -> str:
+    """What trainings log, and which algorithms log it."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for algorithms, paths in METRICS.items():
+        for path in paths:
+            for key, meaning in pkgutil.resolve_name(path).items():
+                found.setdefault((key, meaning), []).append(algorithms)
+    return markdown(
+        ("Name", "Algorithms", "Meaning"),
+        ([f"`{key}`", ", ".join(algorithms), meaning] for (key, meaning), algorithms in found.items()),
+    )
 
 
 # Tasks
@@ -322,12 +362,14 @@ TABLES: dict[str, Callable[..., str]] = {
     "csv": from_csv,
     "geometry": geometry,
     "leaderboard": leaderboard,
+    "metrics": metrics,
     "names": names,
     "planning": planning,
     "published": published,
     "results": results,
     "returns": returns,
     "tasks": tasks,
+    "verification": verification,
 }
 
 
