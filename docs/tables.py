@@ -143,13 +143,13 @@ def planning() -> str:
     )
 
 
-def returns(particles: str) -> str:
-    """Mean returns of all algorithms in all tasks with some particles, from the evaluations with the most episodes."""
+def returns() -> str:
+    """Mean returns of all algorithms in all tasks with full particles, from the evaluations with the most episodes."""
     cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in (*policies(), *read("returns.csv")):
         label = re.sub(r" --learning-rate.*`|, .*", "`", row["algorithm"]).replace(f'("{row["task"]}")', "(task)")
         label = "`distill`" if "distill" in row["algorithm"] else label.replace("``", "`").strip()
-        if row["particles"] == particles and "target" not in row["algorithm"]:
+        if row["particles"] == "full" and "target" not in row["algorithm"]:
             cells.setdefault((row["observes"], label), {}).setdefault(row["task"], []).append(row)
 
     def cell(rows: list[Row]) -> str:
