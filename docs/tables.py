@@ -29,6 +29,7 @@ BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -
 WAYS = {"+x": "right", "-x": "left", "+y": "up", "-y": "down"}
 #: Where algorithms say what they log.
 METRICS = {
+    "all": ("cfp.experiment.callbacks.LOG_METRICS", "cfp.experiment.callbacks.EVALUATION_METRICS"),
     "`cfp-analytic`": ("cfp.analytic.learner.METRICS",),
     "`cfp-sac`": ("cfp.sac.learner.ROLLOUT_METRICS", "cfp.sac.algorithm.METRICS"),
     "`shac`": ("baselines.shac.METRICS",),
@@ -118,8 +119,8 @@ def results() -> str:
                 f"{number(training['steps'])} / {paper.STEPS[task]:,}",
             ]
         )
-    ours = ("this package", "success", "paper's CFP", "minutes on one core", "steps, here / in the paper")
-    return markdown(("", "zero actions", "random actions", *ours), rows)
+    names = ("zero actions", "random actions", "this package", "success", "paper's CFP", "minutes on one core")
+    return markdown(("", *names, "steps, here / in the paper"), rows)
 
 
 def planning() -> str:
@@ -249,12 +250,6 @@ def verification() -> str:
     )
 
 
-def names(*paths: str) -> str:
-    """Names and their meanings, from dictionaries ``package.module.NAME``."""
-    found = {key: meaning for path in paths for key, meaning in pkgutil.resolve_name(path).items()}
-    return markdown(("Name", "Meaning"), ([f"`{key}`", meaning] for key, meaning in found.items()))
-
-
 def metrics() -> str:
     """What trainings log, and which algorithms log it."""
     found: dict[tuple[str, str], list[str]] = {}
@@ -363,7 +358,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "geometry": geometry,
     "leaderboard": leaderboard,
     "metrics": metrics,
-    "names": names,
     "planning": planning,
     "published": published,
     "results": results,
