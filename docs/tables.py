@@ -186,34 +186,30 @@ def leaderboard() -> str:
     return markdown(("Task", "Policies"), ([name_of(task), "; ".join(found)] for task, found in rows.items() if found))
 
 
+def pivot(
+    rows: Iterable[Row], index: Sequence[str], columns: Sequence[str], value: str
+) -> tuple[list[tuple[str, ...]], list[list[str]]]:
+    """Heads and lines of a table that has a line for each value of some columns and a cell for each of others."""
+    lines: dict[tuple[str, ...], dict[tuple[str, ...], str]] = {}
+    for row in rows:
+        lines.setdefault(tuple(row[key] for key in index), {})[tuple(row[key] for key in columns)] = row[value]
+    heads = sorted({head for line in lines.values() for head in line})
+    return heads, [[*key, *(line.get(head, "") for head in heads)] for key, line in lines.items()]
+
+
 def ablation_gradients() -> str:
     """Final returns of the learner from gradients while one option is changed at a time, on SHAPE MATCH."""
     rows = [row for row in read("analytic-shapematch.csv") if row["final"]]
-    found = {(row["part"], row["value"], row["seed"]): row for row in rows}
-    names = [(row["part"], row["value"]) for row in sorted(rows, key=lambda row: -int(row["final"]))]
-    return markdown(
-        ("Changed", "To", "Return, seed 0", "Return, seed 1"),
-        (
-            [part, value]
-            + [found[key]["final"] if (key := (part, value, seed)) in found else "" for seed in ("0", "1")]
-            for part, value in dict.fromkeys(names)
-        ),
-    )
+    rows.sort(key=lambda row: -int(row["final"]))
+    _, lines = pivot(rows, ("part", "value"), ("seed",), "final")
+    return markdown(("Changed", "To", "Return, seed 0", "Return, seed 1"), lines)
 
 
 def ablation_rewards() -> str:
     """Returns of the learner from rewards with each option left out, over ten episodes."""
-    rows = [row for row in read("rewards-ablation.csv") if row["episodes"]]
-    found = {(row["change"], row["task"], row["seed"]): number(row["mean"]) for row in rows}
-    columns = [(task, seed) for task in ("run", "shapematch") for seed in sorted({row["seed"] for row in rows})]
-    columns = [column for column in columns if any((row["task"], row["seed"]) == column for row in rows)]
-    return markdown(
-        ("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in columns)),
-        (
-            [change, *(found.get((change, *column), "") for column in columns)]
-            for change in dict.fromkeys(row["change"] for row in rows)
-        ),
-    )
+    rows = [row | {"mean": number(row["mean"])} for row in read("rewards-ablation.csv") if row["episodes"]]
+    heads, lines = pivot(rows, ("change",), ("task", "seed"), "mean")
+    return markdown(("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in heads)), lines)
 
 
 def best_rewards() -> str:
