@@ -17,7 +17,7 @@ from pathlib import Path
 import dittogym
 from baselines.compare import paper
 from dittogym.bodies.positions import particle_counts
-from dittogym.geometry import Obstacle
+from dittogym.geometry import Box, Obstacle
 from dittogym.spec import BodySpec
 from dittogym.tasks import headline
 from torchmpm import Snow
@@ -26,7 +26,7 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 OBSERVES = ("image", "state", "simulator", "nothing")
 BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -->)")
-WAYS = {"+x": "right", "-x": "left", "+y": "up", "-y": "down"}
+INF = math.inf
 #: Where algorithms say what they log.
 METRICS = {
     "all": ("cfp.experiment.callbacks.LOG_METRICS", "cfp.experiment.callbacks.EVALUATION_METRICS"),
@@ -311,38 +311,40 @@ def constants(task: str) -> str:
 
 
 def geometry(task: str) -> str:
-    """Obstacles of a task: name, visibility and velocity rules."""
+    """Obstacles of a task: name, visibility, friction and edges."""
     return markdown(
-        ("Obstacle", "In the observation", "Matter cannot move"),
+        ("Obstacle", "In the observation", "Friction", "Edges, nodes"),
         (
-            [obstacle.name, "yes" if obstacle.observed_boxes else "no", "; ".join(rules(obstacle))]
+            [
+                obstacle.name,
+                "yes" if obstacle.observed_boxes else "no",
+                friction(obstacle),
+                "; ".join(map(extent, obstacle.boxes)) or "the edges of the window",
+            ]
             for obstacle in dittogym.make_spec(task).obstacles
         ),
     )
 
 
-def rules(obstacle: Obstacle) -> list[str]:
-    """What an obstacle does to matter, in words."""
-    ways: dict[str, list[str]] = {}
-    for rule in obstacle.velocity_rules:
-        place = ", ".join(
-            f"{axis} {extent(*ends)}" for axis, ends in (("i", rule.i), ("j", rule.j)) if ends != (None, None)
-        )
-        friction = " without slip" if math.isinf(rule.friction) else f" with friction {rule.friction:g}"
-        where = f"{place or 'anywhere'}{' of the window' * (rule.frame == 'window')}"
-        way = WAYS[rule.direction] + (friction if rule.friction else "")
-        ways.setdefault(where, [])
-        ways[where] += [way] * (way not in ways[where])
-    return [f"{'at all' if len(found) == 4 else ' or '.join(found)} at {where}" for where, found in ways.items()]
+def friction(obstacle: Obstacle) -> str:
+    """Friction of an obstacle; in the tasks only an upper side has any."""
+    found = {rule.friction for rule in obstacle.velocity_rules}
+    if math.inf not in found:
+        return "none"
+    return "no slip" if found == {math.inf} else "no slip on top"
 
 
-def extent(low: int | None, high: int | None) -> str:
-    """An inclusive range of nodes."""
-    if low is None:
-        return f"≤ {high}"
-    if high is None:
-        return f"≥ {low}"
-    return f"{low}" if low == high else f"{low} … {high}"
+def extent(box: Box) -> str:
+    """Edges of a box in coordinates of nodes."""
+    sides = (("i", box.left, box.right), ("j", box.bottom, box.top))
+    return ", ".join(f"{axis} {span(128 * low, 128 * high)}" for axis, low, high in sides if low > -INF or high < INF)
+
+
+def span(low: float, high: float) -> str:
+    """A range."""
+    if low == -INF:
+        return f"≤ {high:g}"
+    return f"≥ {low:g}" if high == INF else f"{low:g} … {high:g}"
 
 
 TABLES: dict[str, Callable[..., str]] = {
