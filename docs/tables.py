@@ -222,6 +222,15 @@ def best_rewards() -> str:
     )
 
 
+def costs() -> str:
+    """Cost of a step of every task, with full and with lite particles."""
+    rows = read("task-costs.csv")
+    columns = list(rows[0])[2:]  # after the task and the name of the particle count
+    pairs = zip(rows[::2], rows[1::2], strict=True)
+    lines = ([name_of(full["task"]), *(f"{full[key]} / {lite[key]}" for key in columns)] for full, lite in pairs)
+    return markdown(("task", "particles", *columns[1:]), lines)
+
+
 def from_csv(name: str) -> str:
     """A CSV file as it is."""
     rows = read(name)
@@ -352,6 +361,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "ablation-rewards": ablation_rewards,
     "best-rewards": best_rewards,
     "constants": constants,
+    "costs": costs,
     "csv": from_csv,
     "geometry": geometry,
     "leaderboard": leaderboard,
