@@ -292,8 +292,6 @@ class LearningConfig:
 
     learning_rate: float = 3e-4
     """Adam's step size for actor and critics."""
-    actor_rate: float | None = None
-    """Adam's step size for the actor alone; None: the same as for the critics."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -306,10 +304,6 @@ class LearningConfig:
     """Updates after each batched step of num_envs robots."""
     update_start: int = 256
     """Updates begin when more transitions than this are stored."""
-    reward_momentum: float = 0.99
-    """Momentum of the running mean and variance of the rewards."""
-    max_grad_norm: float = 10.0
-    """Largest gradient norm of each parameter tensor."""
     n_steps: int = 1
     """Steps whose rewards a critic's target sums up."""
     final_rate: float = 1.0
@@ -330,11 +324,9 @@ class LearningConfig:
             raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
         if self.n_steps > 1 and self.gamma == 1:
             raise ConfigError("gamma must be below 1 with several n_steps, got 1")
-        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
+        check_fraction(gamma=self.gamma, tau=self.tau, final_rate=self.final_rate)
         check_decay(weight_average=self.weight_average)
-        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
-        if self.actor_rate is not None:
-            check_positive(actor_rate=self.actor_rate)
+        check_positive(learning_rate=self.learning_rate)
 
 
 @dataclass(frozen=True, kw_only=True)

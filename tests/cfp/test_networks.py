@@ -13,7 +13,7 @@ from cfp.agent.actor import (
     make_head,
     upsample,
 )
-from cfp.agent.critics import SmallCritics, TwinCritic
+from cfp.sac.policies import SmallCritics, TwinCritic
 
 
 def trainable(module):
