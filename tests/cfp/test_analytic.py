@@ -12,9 +12,7 @@ import cfp
 import dittogym
 from cfp import CFPAnalytic
 from cfp.agent.actor import ActorSpec, build_actor
-from cfp.analytic.action_step import ActionStep
-from cfp.analytic.learner import METRICS
-from cfp.analytic.regression import ImageMemory, Regression
+from cfp.analytic.learner import METRICS, ActionStep, ImageMemory, Regression
 from cfp.analytic.window import WindowCollector, reward_warnings
 from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
