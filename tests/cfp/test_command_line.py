@@ -18,8 +18,8 @@ from cfp import registry, train
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.page import command_words
 from cfp.experiment.cli import Stopped, program_name, run_command
-from cfp.experiment.training import parse
 from cfp.presets import like_start, sac_preset
+from cfp.train import parse
 
 TINY = "--learner sac --particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
 

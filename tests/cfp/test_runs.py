@@ -59,8 +59,8 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"gama": 0.9}, "gama is not an option of this run; did you mean gamma"),
-        ({"environment": {"particles": 100}}, "environment is not an option .* --help lists them"),
+        ({"gama": 0.9}, "gama is not an option"),
+        ({"environment": {"particles": 100}}, "environment is not an option"),
         ({"particles": "few"}, "particles must be of type .* got 'few'"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"handover": (10, 20)}, "handover must be shares"),

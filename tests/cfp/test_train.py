@@ -20,9 +20,9 @@ import torchmpm
 from cfp import evaluate
 from cfp.config import to_json
 from cfp.experiment import callbacks
-from cfp.experiment.training import parse
 from cfp.policy import read_policy, write_policy
 from cfp.tables import read_table
+from cfp.train import parse
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 
