@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,6 @@ from cfp.experiment.folder import holds_progress, holds_run, policy_files, polic
 from cfp.files import read_json, write_atomically, write_json
 from cfp.learner import Learner
 from cfp.policy import copy_policy, is_of_another_task, read_policy
-from cfp.presets import like_start
 from cfp.tables import CSVTable
 from dittogym.render.frame import png
 
@@ -71,7 +69,6 @@ class TrainingRun:
             )
         self.learner, self.config, self.folder, self.signals = learner, config, folder, signals
         self.stages = len(config.ends())
-        self.seconds = 0.0  # wall time of all sessions, known after training
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         if resume and self.checkpoint.path.exists():
@@ -144,7 +141,6 @@ class TrainingRun:
         except NonFiniteError as error:
             raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
         finally:
-            self.seconds = self.checkpoint.seconds
             self.logger.close()
 
     def _create(self) -> Learner:
@@ -198,13 +194,7 @@ class TrainingRun:
             print(f"{best} has the highest mean return; its policy is {files[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
-        recording = None
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        preset = self.learner.preset(self.config.task, self.config.preset)
-        with suppress(CheckpointError, ConfigError):  # what it started from may be gone, or the hub's client be missing
-            start = {name: getattr(self.config, name, None) for name in ("start_from", "refine")}
-            preset = like_start(preset, start)
-        page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
-        print(f"all of it on one page: {page}")
+        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")

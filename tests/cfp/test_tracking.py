@@ -107,8 +107,6 @@ def test_films_at_intervals_and_weights_and_biases_leave_learning_as_it_was(fini
     with imageio.get_reader(films[1]) as film:
         assert film.get_meta_data()["duration"] == pytest.approx(5.0, abs=0.15)  # 0.8 ms 5,000 times slower, 1 s
     assert_same_run(folder, finished)
-    assert 'href="videos/step000000070.mp4"' in (folder / "index.html").read_text()
-    assert "videos/" not in (finished / "index.html").read_text()
     sent = [(point["step"], point["video"][1]) for point in wandb.points if "video" in point]
     assert sent == [(70, films[0].name), (140, films[1].name)]
     (options,) = wandb.started
