@@ -202,7 +202,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     Args:
         path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, the name of a policy that comes with
             the package, such as ``"run"``, or ``"hf://OWNER/NAME"`` on the Hugging Face Hub, with ``@REVISION`` (a
-            branch, a tag or a commit) and ``?sha256=HASH`` if wanted.
+            branch, a tag or a commit) if wanted.
         device: Device of its tensors.
 
     Returns:
