@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from policy_files import save_actor
@@ -222,18 +221,6 @@ def test_a_step_keeps_its_duration_with_other_substeps():
     config = configure({"task": "run", "train_particles": 500, "train_dt": 2e-4})
     trained = config.for_training().environment
     assert trained == replace(config.environment, particles=500, dt=2e-4, substeps=50)
-
-
-def test_layout_of_actions_can_be_chosen():
-    def field(**values):
-        env = make_env(sac(particles=100, substeps=1, **values), 2, 1)
-        env.reset()
-        env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
-        pull = env.venv.torch_env._actuation[0, 0]
-        return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
-
-    image, grid = field(), field(action_layout="grid")
-    assert image[0] > grid[0] and image[1] == grid[1]  # both above the middle, one right of it and one left
 
 
 def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_without_noise_of_cells():

@@ -115,7 +115,7 @@ def test_interval_is_student_s():
 @pytest.fixture
 def folder(tmp_path):
     config = sac_preset("shapematch")
-    config = replace(config, particles=1000, substeps=10)
+    config = replace(config, particles=1000, substeps=2)
     write_json(tmp_path / "config.json", to_json(config))
     torch.manual_seed(0)  # of a policy with a positive return, which ratios refer to
     save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)

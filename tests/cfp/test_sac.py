@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
-from policy_files import save_actor
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
@@ -20,8 +19,6 @@ from cfp.agent.actor import ActorSpec, Encoded, build_actor, halved, normalise_i
 from cfp.config import Hyperparameters
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.policy import load
-from cfp.presets import sac_preset
 from cfp.sac.learner import LONGEST, METRICS, CellNoise, critic_target
 from cfp.sac.policies import SmallCritics
 
@@ -451,20 +448,6 @@ def test_halved_images_are_means_of_four_pixels():
     torch.testing.assert_close(halved(image), expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(halved(normalise_image(image)), expected, rtol=0, atol=1e-6)
     assert halved(expected) is expected
-
-
-def test_small_policy_is_saved_and_loaded(tmp_path):
-    config = sac_preset("run", "quick")
-    spec = config.actor_spec(2)
-    assert spec.encoder == "small"
-    actor, images = build_actor(spec), make_batch(8).observations
-    save_actor(tmp_path / "policy.safetensors", actor, config, 2, 5)
-    loaded = load(tmp_path)
-    assert loaded.spec == spec
-    assert torch.equal(loaded(images, deterministic=True), actor(images, deterministic=True))
-    full = build_actor(replace(spec, encoder="paper"))
-    count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, full)]
-    assert count[0] < 0.8 * count[1]
 
 
 @pytest.mark.parametrize("patch", [18, 32])
