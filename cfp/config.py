@@ -99,8 +99,6 @@ class RunConfig(EnvironmentConfig, TaskConfig):
     """Environment steps between rows of progress.csv and TensorBoard points."""
     video: bool = True
     """Record video.mp4 at the end."""
-    video_every: int = 0
-    """Environment steps between videos of one episode in videos/; 0: none."""
     wandb: Literal["off", "offline", "online"] = "off"
     """Weights & Biases: off, offline (kept in the folder of the run), or online (uploads)."""
     wandb_project: str = "torchmpm"
@@ -108,7 +106,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
 
     changeable: ClassVar[tuple[str, ...]] = (
         *("device", "backend", "eval_every", "checkpoint_every", "log_every"),
-        *("video", "video_every", "wandb", "wandb_project"),
+        *("video", "wandb", "wandb_project"),
     )
     """Options that a resumed run may change."""
 
@@ -179,7 +177,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
             raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
         check_at_least(1, num_envs=self.num_envs, eval_episodes=self.eval_episodes, log_every=self.log_every)
         check_at_least(1, checkpoint_every=self.checkpoint_every)
-        check_at_least(0, eval_every=self.eval_every, video_every=self.video_every)
+        check_at_least(0, eval_every=self.eval_every)
         if self.substeps is not None:
             check_at_least(1, substeps=self.substeps)
         check_positive(dt=self.dt)
