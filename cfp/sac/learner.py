@@ -257,42 +257,33 @@ class CFP(SAC):
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
         assert isinstance(self.policy, NetworkPolicy)
+        actor, critic, target = self.networks()
         obs = self.policy.encode(batch.observations)
         if not self.trains_encoder:
             obs = obs.detach()
         with torch.no_grad():
             next_obs = self.policy.encode(batch.next_observations)
-        scalars = self._update_critic(obs, next_obs, batch)
-        if self.num_timesteps >= self.hyperparameters.actor_start:
-            scalars |= self._update_actor(obs.detach())
-        actor, critic, target = self.networks()
-        if self.average is not None:
-            self.average.update_parameters(actor)
-        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
-        return scalars | self.reward_statistics.scalars()
-
-    def _update_critic(
-        self, obs: NetworkInput, next_obs: NetworkInput, batch: ReplayBufferSamples
-    ) -> dict[str, Tensor]:
-        actor, critic, target = self.networks()
         gamma: Tensor | float = self.gamma
         part: Tensor | float = 1.0
-        if batch.discounts is not None:
-            gamma, whole = batch.discounts, 1 - self.gamma**self.hyperparameters.n_steps
-            part = (1 - gamma) / whole
+        if batch.discounts is not None:  # rewards are sums over several steps, of which some end early
+            gamma = batch.discounts
+            part = (1 - gamma) / (1 - self.gamma**self.hyperparameters.n_steps)
         rewards, not_done = self.reward_statistics(batch.rewards, part), 1 - batch.dones
         target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, gamma)
         loss = critic_loss(critic, obs, batch.actions, target_q)
         self._descend(loss, critic.optimizer, "critic")
-        return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
-
-    def _update_actor(self, obs: NetworkInput) -> dict[str, Tensor]:
-        actor, critic, _ = self.networks()
-        critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
-        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, self.hyperparameters.gate_penalty)
-        self._descend(loss, actor.optimizer, "actor")
-        critic.requires_grad_(True)
-        return scalars | {"actor_loss": loss.detach()}
+        scalars = {"critic_loss": loss.detach(), "q_target": target_q.mean()}
+        if self.num_timesteps >= self.hyperparameters.actor_start:
+            critic.requires_grad_(False)  # avoids weight gradients of the critics, which would be discarded
+            penalty = self.hyperparameters.gate_penalty
+            loss, of_actor = actor_loss(actor, critic, obs.detach(), self.ent_coef_tensor, penalty)
+            self._descend(loss, actor.optimizer, "actor")
+            critic.requires_grad_(True)
+            scalars |= of_actor | {"actor_loss": loss.detach()}
+        if self.average is not None:
+            self.average.update_parameters(actor)
+        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
+        return scalars | self.reward_statistics.scalars()
 
     def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
         optimizer.zero_grad()
