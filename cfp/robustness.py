@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
 from cfp.envs.disturbances import FRICTION, Case, changes_something, disturbed_env, make_cases
-from cfp.envs.make import batch_size
 from cfp.errors import ConfigError, check_at_least
 from cfp.evaluate import Selection
 from cfp.evaluation.page import write_figure
-from cfp.evaluation.returns import Result, Trial, decision_grid, evaluate, evaluation_seed, numbers
+from cfp.evaluation.returns import Result, evaluate, evaluation_seed, make_trial, numbers
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import write_json, write_text
@@ -100,17 +99,12 @@ def report(
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = config.make_spec(), evaluation_seed(config)
-    grid = decision_grid(policy)
+    trial = make_trial(config, "", policy, episodes, deterministic=deterministic, seed=seed)
     trials = [
-        Trial(
+        replace(
+            trial,
             name=case.name,
-            resolution=grid,
-            policy=policy,
-            make_env=partial(disturbed_env, config, policy.resolution, case, grid),
-            episodes=episodes,
-            deterministic=deterministic,
-            seed=seed,
-            batch=batch_size(config, episodes),
+            make_env=partial(disturbed_env, config, policy.resolution, case, trial.resolution),
         )
         for case in cases
         if changes_something(case, spec, policy.uses_image)

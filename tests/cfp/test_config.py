@@ -94,16 +94,13 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"steps": "x"}, "steps must be of type int, got 'x'"),
-        ({"steps": 1.5}, "steps must be of type int"),
-        ({"steps": None}, "steps must be of type int"),
+        ({"steps": 1.5}, "steps must be of type int, got 1.5"),
         ({"steps": True}, "steps must be of type int"),
         ({"video": 1}, "video must be of type bool"),
         ({"tau": "0.5"}, "tau must be of type float"),
         ({"dtype": "float16"}, r"dtype must be of type Literal\['float32', 'float64'\]"),
         ({"particles": [1.5, 2]}, "particles must be of type"),
         ({"alpha": [0.1, "x"]}, r"alpha must be of type tuple\[float, ...\]"),
-        ({"alpha": [0.1, True]}, "alpha must be of type"),
         ({"resolutions": 8}, "resolutions must be of type"),
         ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
         ({"target": 3}, "target must be of type str | None"),
