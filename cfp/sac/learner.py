@@ -154,6 +154,53 @@ def actor_loss(
     return loss, scalars
 
 
+class CellNoise:
+    """Gaussian noise for actions (n, 2, R, R), equal in each of ``cells`` x ``cells`` blocks, and held for some steps.
+
+    Independent noise averages out over the body and over time. Noise that is held for a random number of steps is from
+    Dabney et al., "Temporally-extended epsilon-greedy exploration" (ICLR 2021), and is used so by FlashSAC (2026); pink
+    noise (Eberhard et al., ICLR 2023) is a relative. Another scale for each robot is from Ape-X (Horgan et al., ICLR
+    2018).
+
+    Args:
+        num_envs: n.
+        resolution: R.
+        cells: Blocks along each side; at most R.
+        scale: Standard deviations of the first and of the last robot; those between are spaced geometrically.
+        seed: Of the generator.
+    """
+
+    def __init__(
+        self, num_envs: int, resolution: int, cells: int, scale: tuple[float, float], seed: int | None
+    ) -> None:
+        if cells > resolution:
+            raise ConfigError(f"noise_cells must be at most {resolution}, the action grid, got {cells}")
+        self.block = resolution // cells
+        self.scale = np.geomspace(*scale, num_envs, dtype=np.float32)[:, None, None, None]
+        self.values = np.zeros((num_envs, 2, cells, cells), np.float32)
+        self.left = np.zeros(num_envs, np.int64)
+        self.generator = np.random.default_rng(seed)
+
+    def __call__(self) -> Tensor:
+        """The noise (n, 2, R, R) of the next step."""
+        due = np.flatnonzero(self.left == 0)
+        self.values[due] = self.generator.standard_normal((len(due), *self.values.shape[1:]), np.float32)
+        self.left[due] = np.minimum(self.generator.zipf(EXPONENT, len(due)), LONGEST)
+        self.left -= 1
+        blocks = (self.scale * self.values).repeat(self.block, axis=2).repeat(self.block, axis=3)
+        return torch.from_numpy(blocks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Noise, steps left, and state of the generator."""
+        generator = self.generator.bit_generator.state
+        return {"values": torch.from_numpy(self.values), "left": torch.from_numpy(self.left), "generator": generator}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        self.values, self.left = (state[name].numpy().copy() for name in ("values", "left"))
+        self.generator.bit_generator.state = state["generator"]
+
+
 class CFP(SAC):
     """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
@@ -371,14 +418,26 @@ class CFP(SAC):
     def state_dict(self) -> dict[str, Any]:
         """All that it learns and counts but ``num_timesteps`` and the replay buffer, as tensors and plain values."""
         values = self.logger.name_to_value  # of the row that comes next
+        monitor, env = self._environments()
+        generators: dict[str, Any] = {"torch": torch.get_rng_state()} | {
+            name: generator.bit_generator.state for name, generator in self._generators().items()
+        }
+        if self.device.type == "cuda":
+            generators["cuda"] = torch.cuda.get_rng_state(self.device)
         return {name: part.state_dict() for name, part in self._parts().items()} | {
             "episodes": self._episode_num,
             "updates": self._n_updates,
             "recent": [{key: float(value) for key, value in info.items()} for info in self.ep_info_buffer or ()],
             "successes": [bool(success) for success in self.ep_success_buffer or ()],
             "means": {name: (values[name], count) for name, count in self.logger.name_to_count.items()},
-            "environment": self._environment_state(),
-            "random": self._random_state(),
+            "environment": {  # the episodes in progress
+                "episodes": env.state_dict(),
+                "generators": env.torch_env.generators,
+                "returns": torch.from_numpy(monitor.episode_returns.copy()),
+                "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
+                "observation": torch.from_numpy(np.array(self._last_obs)),
+            },
+            "random": generators,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -391,8 +450,19 @@ class CFP(SAC):
         for name, (mean, count) in state["means"].items():
             self.logger.record_mean(name, mean)
             self.logger.name_to_count[name] = count
-        self._restore_environment(state["environment"])
-        self._restore_random(state["random"])
+        monitor, env = self._environments()
+        monitor.reset()  # so that later episodes start as they would have
+        episodes, generators = state["environment"], state["random"]
+        env.load_state_dict(episodes["episodes"])
+        env.torch_env.generators = episodes["generators"]
+        monitor.episode_returns = episodes["returns"].numpy().copy()
+        monitor.episode_lengths = episodes["lengths"].numpy().copy()
+        self._last_obs = episodes["observation"].numpy().copy()
+        torch.set_rng_state(generators["torch"])
+        for name, generator in self._generators().items():
+            generator.bit_generator.state = generators[name]
+        if "cuda" in generators and self.device.type == "cuda":
+            torch.cuda.set_rng_state(generators["cuda"], self.device)
 
     def _parts(self) -> dict[str, Any]:
         """What has a state of its own."""
@@ -402,97 +472,15 @@ class CFP(SAC):
         optional = {"noise": self.noise, "average": self.average}
         return parts | {name: part for name, part in optional.items() if part is not None}
 
-    def _environment_state(self) -> dict[str, Any]:
-        """The episodes in progress: the matter, the sums of their rewards, and what the policy sees next."""
-        monitor, env = self._environments()
-        return {
-            "episodes": env.state_dict(),
-            "generators": env.torch_env.generators,
-            "returns": torch.from_numpy(monitor.episode_returns.copy()),
-            "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
-            "observation": torch.from_numpy(np.array(self._last_obs)),
-        }
-
-    def _restore_environment(self, state: dict[str, Any]) -> None:
-        monitor, env = self._environments()
-        monitor.reset()  # so that later episodes start as they would have
-        env.load_state_dict(state["episodes"])
-        env.torch_env.generators = state["generators"]
-        monitor.episode_returns = state["returns"].numpy().copy()
-        monitor.episode_lengths = state["lengths"].numpy().copy()
-        self._last_obs = state["observation"].numpy().copy()
-
     def _environments(self) -> tuple[VecMonitor, TorchVecEnv]:
         monitor = self.get_env()
         assert isinstance(monitor, VecMonitor) and isinstance(monitor.venv, TorchVecEnv)
         return monitor, monitor.venv
 
-    def _random_state(self) -> dict[str, Any]:
-        """States of every generator that training draws from: torch's, the replay memory's, the action space's."""
+    def _generators(self) -> dict[str, np.random.Generator]:
+        """Those that training draws from, beside torch's: the replay memory's, and the action space's."""
         assert isinstance(self.replay_buffer, ReplayRing)
-        state: dict[str, Any] = {
-            "torch": torch.get_rng_state(),
-            "replay": self.replay_buffer.generator.bit_generator.state,
-            "actions": self.action_space.np_random.bit_generator.state,
-        }
-        if self.device.type == "cuda":
-            state["cuda"] = torch.cuda.get_rng_state(self.device)
-        return state
-
-    def _restore_random(self, state: dict[str, Any]) -> None:
-        assert isinstance(self.replay_buffer, ReplayRing)
-        torch.set_rng_state(state["torch"])
-        self.replay_buffer.generator.bit_generator.state = state["replay"]
-        self.action_space.np_random.bit_generator.state = state["actions"]
-        if "cuda" in state and self.device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda"], self.device)
-
-
-class CellNoise:
-    """Gaussian noise for actions (n, 2, R, R), equal in each of ``cells`` x ``cells`` blocks, and held for some steps.
-
-    Independent noise averages out over the body and over time. Noise that is held for a random number of steps is from
-    Dabney et al., "Temporally-extended epsilon-greedy exploration" (ICLR 2021), and is used so by FlashSAC (2026); pink
-    noise (Eberhard et al., ICLR 2023) is a relative. Another scale for each robot is from Ape-X (Horgan et al., ICLR
-    2018).
-
-    Args:
-        num_envs: n.
-        resolution: R.
-        cells: Blocks along each side; at most R.
-        scale: Standard deviations of the first and of the last robot; those between are spaced geometrically.
-        seed: Of the generator.
-    """
-
-    def __init__(
-        self, num_envs: int, resolution: int, cells: int, scale: tuple[float, float], seed: int | None
-    ) -> None:
-        if cells > resolution:
-            raise ConfigError(f"noise_cells must be at most {resolution}, the action grid, got {cells}")
-        self.block = resolution // cells
-        self.scale = np.geomspace(*scale, num_envs, dtype=np.float32)[:, None, None, None]
-        self.values = np.zeros((num_envs, 2, cells, cells), np.float32)
-        self.left = np.zeros(num_envs, np.int64)
-        self.generator = np.random.default_rng(seed)
-
-    def __call__(self) -> Tensor:
-        """The noise (n, 2, R, R) of the next step."""
-        due = np.flatnonzero(self.left == 0)
-        self.values[due] = self.generator.standard_normal((len(due), *self.values.shape[1:]), np.float32)
-        self.left[due] = np.minimum(self.generator.zipf(EXPONENT, len(due)), LONGEST)
-        self.left -= 1
-        blocks = (self.scale * self.values).repeat(self.block, axis=2).repeat(self.block, axis=3)
-        return torch.from_numpy(blocks)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Noise, steps left, and state of the generator."""
-        generator = self.generator.bit_generator.state
-        return {"values": torch.from_numpy(self.values), "left": torch.from_numpy(self.left), "generator": generator}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
-        self.values, self.left = (state[name].numpy().copy() for name in ("values", "left"))
-        self.generator.bit_generator.state = state["generator"]
+        return {"replay": self.replay_buffer.generator, "actions": self.action_space.np_random}
 
 
 class SACLearner(CFP, Learner):
