@@ -38,7 +38,7 @@ from cfp.agent.actor import (
 from cfp.policy import check_images
 
 
-class Critic(nn.Module):
+class PaperCritic(nn.Module):
     """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
     def __init__(self, split: bool) -> None:
@@ -56,13 +56,13 @@ class TwinCritic(nn.Module):
     def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
         super().__init__()
         self.resolution, self.interpolation = resolution, interpolation
-        self.critics = nn.ModuleList(Critic(split) for _ in range(2))
+        self.critics = nn.ModuleList(PaperCritic(split) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         """Values (B, 1) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
         image = normalise_image(observation)
         patch = upsample(action.reshape(-1, 2, self.resolution, self.resolution), IMAGE_SIZE, self.interpolation)
-        critics = cast(list[Critic], list(self.critics))
+        critics = cast(list[PaperCritic], list(self.critics))
         encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
         inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
         parts = [encode(pair, *seen).unflatten(1, (2, -1)) for pair, seen in zip(encoders, inputs, strict=True)]
