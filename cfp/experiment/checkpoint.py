@@ -20,7 +20,7 @@ from cfp.files import parse_json, write_atomically
 from cfp.learner import Learner
 from dittogym.trajectories import ZIP_ERRORS
 
-VERSION = 4
+VERSION = 3
 #: What torch raises for damaged files, besides ``pickle.UnpicklingError``.
 UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
 
