@@ -31,7 +31,7 @@ INF = math.inf
 METRICS = {
     "all": ("cfp.experiment.callbacks.LOG_METRICS", "cfp.experiment.callbacks.EVALUATION_METRICS"),
     "`cfp-analytic`": ("cfp.analytic.learner.METRICS",),
-    "`cfp-sac`": ("cfp.sac.learner.ROLLOUT_METRICS", "cfp.sac.algorithm.METRICS"),
+    "`cfp-sac`": ("cfp.sac.learner.METRICS",),
     "`shac`": ("baselines.shac.METRICS",),
     "`distill`": ("baselines.distillation.learner.METRICS",),
     "`gradient`": ("baselines.trajectory.METRICS",),
