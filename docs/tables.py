@@ -424,7 +424,8 @@ TABLES: dict[str, Callable[..., str]] = {
 def pages() -> list[Path]:
     """Pages that contain tables."""
     built = {"_build", "gallery"}
-    found = [ROOT / "README.md", *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
+    own = (ROOT / "README.md", ROOT / "benchmarks/README.md")
+    found = [*own, *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
     return [path for path in sorted(found) if BLOCK.search(path.read_text())]
 
 
