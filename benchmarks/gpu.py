@@ -231,7 +231,8 @@ def additions(lab: Lab) -> Figures:
 
     driver, device = Cuda(), torch.device("cuda", torch.cuda.current_device())
     major, minor = torch.cuda.get_device_capability()
-    binary, blocks, threads, rounds = compile_source(ADDITIONS, f"sm_{major}{minor}", {}), 132, 512, 1000
+    binary, threads, rounds = compile_source(ADDITIONS, f"sm_{major}{minor}", {}), 512, 1000
+    blocks = torch.cuda.get_device_properties(device).multi_processor_count
     room, found = torch.zeros(blocks * 9216, device=lab.device), {}
     arguments = Arguments(room.data_ptr(), rounds)
     for name in ("global_one", "global_four", "shared_float", "shared_int"):
