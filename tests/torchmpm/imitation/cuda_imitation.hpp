@@ -17,7 +17,6 @@
 #define THREAD (imitation::self().thread)
 #define BLOCK (imitation::self().block->index)
 #define BLOCKS (imitation::machine().blocks())
-#define WARP 1  // a thread is a warp
 #define BARRIER(name) imitation::barrier(name)
 
 namespace imitation {
@@ -58,7 +57,6 @@ template <Atomic name> uint32_t count(uint32_t* counter) {
 template <class Number> Number look(Number* at) { return imitation::look(at); }
 template <class Number> void mark(Number* at) { imitation::mark(at); }
 inline void fence() {}
-inline int largest_of_warp(int value) { return value; }
 
 // As on a GPU, numbers that are too large become the largest integer, and NaN becomes 0.
 template <class Integer> void round_to(Real value, Integer& to) {

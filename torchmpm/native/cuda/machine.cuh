@@ -44,7 +44,6 @@ enum Atomic : int {
 #define THREAD int(threadIdx.x)
 #define BLOCK int(blockIdx.x)
 #define BLOCKS int(gridDim.x)
-#define WARP 32
 #define BARRIER(name) __syncthreads()
 
 INLINE char* shared_memory() {
@@ -64,16 +63,6 @@ template <class Number> INLINE Number look(Number* at) { return *static_cast<vol
 template <class Number> INLINE void mark(Number* at) { *at = 1; }
 // Orders what a thread wrote before an atomic operation with what others read after they saw it.
 INLINE void fence() { __threadfence(); }
-
-// The largest of the values of a warp's threads.
-INLINE int largest_of_warp(int value) {
-#if __CUDA_ARCH__ >= 800
-    return __reduce_max_sync(0xffffffffu, value);
-#else
-    for (int other = WARP / 2; other > 0; other /= 2) value = max(value, __shfl_xor_sync(0xffffffffu, value, other));
-    return value;
-#endif
-}
 
 // The nearest integer.
 INLINE void round_to(Real value, int32_t& to) { to = sizeof(Real) == 4 ? __float2int_rn(float(value)) : __double2int_rn(value); }

@@ -153,10 +153,10 @@ private:
         velocity_bar = {0, 0};
         NodeBar out{{0, 0}, 0};
         if (robot.exists(i, j)) {
-            const Real raw[2] = {tape.x[node], tape.y[node]}, damping = Real(robot.given.damping);
-            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * damping;
+            const Real raw[2] = {tape.x[node], tape.y[node]};
+            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * robot.damping;
             constrain_adjoint(robot.rules, robot.codes[i * robot.width() + j], v, bar);
-            for (int c = 0; c < 2; ++c) bar[c] *= damping, gain_bar[c] += bar[c];
+            for (int c = 0; c < 2; ++c) bar[c] *= robot.damping, gain_bar[c] += bar[c];
             out = node_adjoint(bar, raw, tape.inverse[node]);
         }
         robot.nodes.velocity[node] = {v[0], v[1]};
