@@ -10,5 +10,5 @@ the order in which they build on each other: ``simd``, ``team``, ``scene``, ``tr
 There a simulation's particles are cut into blocks of 64, each of one body. One pass over the blocks reads velocities
 from the nodes, moves and deforms the particles, and adds mass and momentum to the nodes for the next substep. The sums
 of a few groups of blocks are kept apart and added in one order, so results do not depend on the number of threads, nor
-on what else is in the batch. The adjoint replays a step from its start onto a tape, then goes back with the same passes.
+on what else is in the batch. The adjoint replays a step from its start onto a tape, then goes back with these passes.
 """
