@@ -93,10 +93,9 @@ lint: install  ## style, formatting, types
 
 docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings and dead links are errors
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
-	$(BIN)/python docs/links.py docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
-bench: install  ## milliseconds a substep
+bench: install  ## time of substeps, of environment steps and of trainings
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-columns=min,median,iqr,rounds --benchmark-sort=name
 
 # What a wheel has compiled kernels for.

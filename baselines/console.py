@@ -7,14 +7,12 @@ from importlib import import_module
 
 #: Module of each program, with a function ``main``, and what it does.
 PROGRAMS = {
-    "train": ("baselines.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
-    "evaluate": ("baselines.evaluate", "returns of a trained policy, with films and recorded trajectories"),
-    "replay": ("baselines.replay", "an episode of a policy, to watch in a browser"),
-    "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
-    "play": ("baselines.play", "play with a robot on a page in the browser"),
+    "train": ("cfp.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
+    "evaluate": ("cfp.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
+    "robustness": ("cfp.robustness", "returns of a policy in disturbed simulations"),
+    "play": ("cfp.play.__main__", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
     "leaderboard": ("baselines.leaderboard", "evaluate and rank policies under a fixed protocol"),
-    "distill": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
 }
 EXAMPLES = """Examples:
   torchmpm train --task run --out runs/run
@@ -45,10 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in PROGRAMS:
         print(f"error: PROGRAM must be one of {', '.join(PROGRAMS)}, got {name!r}", file=sys.stderr)
         return 2
-    module, _ = PROGRAMS[name]
     sys.path.insert(0, os.getcwd())  # as `python -m` does, for tasks that are defined there
     sys.argv = [f"torchmpm {name}", *words]  # from which the programs read their options and their name
-    code: int = import_module(module).main()
+    import_module("baselines.registry")  # adds the algorithms of this package
+    code: int = import_module(PROGRAMS[name][0]).main()
     return code
 
 

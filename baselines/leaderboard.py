@@ -22,10 +22,11 @@ import torchmpm
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluation import play_episodes
 from baselines.compare.plan import RECORD
-from baselines.compare.report import SEES, t_interval
+from baselines.compare.report import SEES
 from baselines.registry import configure, load, sees
 from cfp.config import EnvironmentConfig, RunConfig
 from cfp.errors import ConfigError
+from cfp.evaluation.returns import t_interval
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import read_json, write_json
@@ -129,7 +130,7 @@ def candidates(name: str, tasks: Sequence[str]) -> list[tuple[dict[str, Any], Po
         about = {
             "policy": _shown_name(name, task),
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "sees": description.get("sees", sees(algo_of(description))),
+            "sees": sees(algo_of(description)),
             "training": {"steps": description["steps"], "minutes": _minutes(file.parent)},
         }
     for task in found:

@@ -9,8 +9,8 @@ from cfp.registry import ALGORITHMS, configure, find, load
 __all__ = ["ALGORITHMS", "configure", "find", "load", "sees"]
 
 ALGORITHMS |= {
-    "coarse": "baselines.common.single_stage:Coarse",
-    "fine": "baselines.common.single_stage:Fine",
+    "coarse": "baselines.single_stage:Coarse",
+    "fine": "baselines.single_stage:Fine",
     "gnn-16": "baselines.modular.learner:Modular",
     "gnn-64": "baselines.modular.learner:Modular",
     "transformer-16": "baselines.modular.learner:Modular",

@@ -7,7 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,25 +15,13 @@ from torch import Tensor, nn
 
 from baselines.common.grid import GridConfig, long_dt
 from baselines.common.policies import StateBasedPolicy, load_network
-from cfp.agent.actor import LATENT, Actor, ActorSpec, Encoder, initialise
 from cfp.analytic.critic import BETAS, Critic, StateFeatures, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig, WindowConfig
 from cfp.envs.make import choose_device, make_env, seeded
-from cfp.errors import ConfigError, NonFiniteError, check_at_least
-from cfp.experiment.folder import start_path
+from cfp.errors import NonFiniteError, check_at_least
 from cfp.learner import Learner, NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
-from cfp.policy import (
-    KIND,
-    ActorPolicy,
-    Memory,
-    copy_policy,
-    load,
-    policy_for,
-    read_policy,
-    report_mismatch,
-    write_policy,
-)
+from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from cfp.presets import ON_SPEED, sac_preset
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
@@ -62,18 +50,10 @@ class ShacConfig(GridConfig, WindowConfig):
     """Which algorithm."""
     steps: int = 13_000
     """Environment steps of all robots together."""
-    sees: Literal["state", "image"] = "state"
-    """Input of the policy: the privileged state (matter, deformation, clock), or the image like CFP's."""
-    start_from: str | None = None
-    """Policy of the image with one stage from which the actor starts, except for its standard deviation."""
     noise: float = 0.1
-    """Standard deviation of actions before tanh (an image policy keeps its network's own, about 0.1)."""
-    deformation: bool = True
-    """A policy of the state sees deformation."""
-    clock: bool = True
-    """A policy of the state sees a clock."""
+    """Standard deviation of actions before tanh."""
     displacement: bool = False
-    """A policy of the state sees the robot's displacement since the reset."""
+    """The policy observes the robot's displacement since the reset."""
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -85,8 +65,6 @@ class ShacConfig(GridConfig, WindowConfig):
         """Check what the types do not express."""
         super().check()
         check_at_least(1, steps=self.steps)
-        if self.start_from is not None and self.sees != "image":
-            raise ConfigError(f"start_from is allowed with sees 'image' only, got sees {self.sees!r}")
         check_at_least(0, noise=self.noise)
 
 
@@ -102,26 +80,6 @@ class StateActor(nn.Module):
         """Mean before tanh."""
         output: Tensor = self.body(features)
         return output.unflatten(1, (2, self.resolution, self.resolution))
-
-
-class ImageActor(nn.Module):
-    """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed."""
-
-    def __init__(self, resolution: int) -> None:
-        super().__init__()
-        self.spec = ActorSpec((resolution,))
-        self.actor = Actor(resolution, self.spec)
-        self.actor.fix_std()
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Mean before tanh, (B, 2, R, R), of images (B, 3, 64, 64) in [-1, 1]."""
-        mean: Tensor = self.actor.mean(self.actor.encoder(image))
-        return mean
-
-
-def image_critic() -> nn.Module:
-    """Value (B, 1) of images (B, 3, 64, 64) in [-1, 1], with an encoder like the actor's."""
-    return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), mlp(LATENT, 1)))
 
 
 class StatePolicy(StateBasedPolicy):
@@ -185,17 +143,18 @@ class Shac(Resumable, UpdateLoop, Learner):
 
     def _setup_model(self) -> None:
         config = self.config
-        self.features = StateFeatures(config.deformation, config.clock, config.displacement)
+        self.features = StateFeatures(displacement=config.displacement)
+        size = self.features.size(len(config.make_spec().bodies) - 1)
         with seeded(config.seed):
-            self.actor, critic = self._make_networks()
+            self.actor = StateActor(size, config.resolution(self.stage)).to(self.device)
+            critic = mlp(size, 1).to(self.device)
         self.critic = Critic(critic, config)
-        trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
-        self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
+        self.actor_adam = torch.optim.Adam(self.actor.parameters(), config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
         networks = {"value": critic, "target": self.critic.target}
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor, **networks)
-        if self.env is not None:  # a loaded model of images can act without one
+        if self.env is not None:  # a model can be loaded before it gets one
             self.begin_episodes()
 
     def begin_episodes(self) -> None:
@@ -203,21 +162,12 @@ class Shac(Resumable, UpdateLoop, Learner):
         self.collector = WindowCollector(self.simulation, self.observe, self.config)
         self._last_obs = self.simulation.observation().cpu().numpy()
 
-    def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
-        resolution, device = self.config.resolution(self.stage), self.device
-        if self.config.sees == "image":
-            return ImageActor(resolution).to(device), image_critic().to(device)
-        size = self.features.size(len(self.config.make_spec().bodies) - 1)
-        return StateActor(size, resolution).to(device), mlp(size, 1).to(device)
-
     def observe(self) -> Tensor:
-        """Inputs (B, ...) of the networks in the present state."""
-        if self.config.sees == "state":
-            return self.features(self.simulation).float()
-        return self.simulation.soft_observation().float() * (2.0 / 255.0) - 1.0
+        """Features (B, D) of the present state."""
+        return self.features(self.simulation).float()
 
     def act(self, observation: Tensor) -> Tensor:
-        """Actions (B, 2, R, R) with noise for an ``observation`` (B, ...), with the autograd graph of the actor."""
+        """Actions (B, 2, R, R) with noise for an ``observation`` (B, D), with the autograd graph of the actor."""
         mean: Tensor = self.actor(observation)
         noise = torch.randn(mean.shape, generator=self.generator).to(mean)
         return (mean + self.config.noise * noise).tanh()
@@ -272,14 +222,9 @@ class Shac(Resumable, UpdateLoop, Learner):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """Act on an ``observation``, see stable-baselines3's ``predict``: without noise if ``deterministic``.
-
-        A policy of the state acts on the present one of the simulation. ``state`` is returned as it is, and
-        ``episode_start`` has no effect, as the policies have no memory.
-        """
-        policy = self.trained_policy
-        acting = policy.attached(self.simulation) if isinstance(policy, StatePolicy) else policy
-        return acting.predict(observation, state, episode_start, deterministic)
+        """Act on the present state of the simulation, see `StatePolicy.predict`: without noise if ``deterministic``."""
+        policy = self.trained_policy.attached(self.simulation)
+        return policy.predict(observation, state, episode_start, deterministic)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor_adam", "critic.adam"], []
@@ -288,12 +233,10 @@ class Shac(Resumable, UpdateLoop, Learner):
         return [*super()._excluded_save_params(), *self.parts, "generator", "features", "_callback"]
 
     @property
-    def trained_policy(self) -> StatePolicy | ActorPolicy:
-        """What has been learned so far; a policy of the state must be attached to an environment."""
-        deterministic = self.config.eval_deterministic
-        if isinstance(self.actor, StateActor):
-            return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
-        return ActorPolicy(self.actor.spec, deterministic, self.actor.actor)
+    def trained_policy(self) -> StatePolicy:
+        """What has been learned so far; it must be attached to an environment."""
+        description = {"deterministic": self.config.eval_deterministic}
+        return StatePolicy(self.actor, self.features, self.config.noise, description)
 
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
@@ -325,40 +268,18 @@ class Shac(Resumable, UpdateLoop, Learner):
         return reward_warnings(config)
 
     @classmethod
-    def begin(cls, config: ShacConfig, folder: Path) -> tuple[int, int]:
-        """Copy the policy from which the actor starts into the folder, if the options name one."""
-        if config.start_from is None:
-            return 1, 0
-        policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
-        if policy.spec.resolutions != resolutions:
-            raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
-        if policy.spec.encoder != "paper":
-            raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
-        copy_policy(config.start_from, start_path(folder))
-        return 1, 0
-
-    @classmethod
     def create(cls, config: ShacConfig, stage: int, folder: Path) -> Shac:
-        """Networks and environment, with the policy from which the actor starts."""
+        """Networks and environment."""
         env = make_env(config.for_training(), config.resolution(stage))
-        learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
-        if config.start_from is not None:
-            assert isinstance(learner.actor, ImageActor)
-            learner.actor.actor.load_state_dict(load(start_path(folder)).actor.state_dict())
-            learner.actor.actor.fix_std()
-            learner.starts_trained = True
-        return learner
+        return cls("NetworksPolicy", env, config, stage, choose_device(config.device))
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy; one of the image becomes a policy of CFP."""
+        """Write the policy."""
         policy = self.trained_policy
-        policy.description = {**description, "sees": self.config.sees}
-        if isinstance(policy, ActorPolicy):
-            network = {"resolutions": [policy.resolution]}
-            policy.description |= {"kind": KIND, "network": network, "trained_by": self.config.algo}
+        policy.description = description
         policy.save(path)
 
     @classmethod
-    def load_policy(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:
-        """Load a policy of either kind."""
-        return load(path, device) if read_policy(path)[1]["kind"] == KIND else StatePolicy.load(path, device)
+    def load_policy(cls, path: Path, device: str = "cpu") -> StatePolicy:
+        """Load a policy."""
+        return StatePolicy.load(path, device)

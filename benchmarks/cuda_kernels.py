@@ -22,12 +22,14 @@ from torchmpm.native.cuda.plan import Call, Pass, passes
 #: The first cards of a generation: A100, RTX 4090, H100, RTX 5090. Memory that a block may share, KB, from the
 #: CUDA programming guide.
 ARCHITECTURES = {"sm_80": 163, "sm_89": 99, "sm_90": 227, "sm_120": 99}
-#: Particles, bodies and materials (a bit for each, in the order of torchmpm.native.tables.KINDS) of scenes.
+#: Robots, particles, bodies and materials (a bit for each, in the order of torchmpm.native.tables.KINDS) of scenes.
 SCENES = {
-    "RUN, lite": (2_000, 1, 0b010),
-    "RUN, full": (22_000, 1, 0b010),
-    "CATCH, lite": (2_200, 2, 0b011),
-    "DIG, lite": (5_400, 2, 0b110),
+    "RUN": (1, 2_000, 1, 0b010),
+    "RUN, full size": (1, 22_000, 1, 0b010),
+    "64 × RUN, full size": (64, 22_000, 1, 0b010),
+    "CATCH": (1, 2_200, 2, 0b011),
+    "DIG": (1, 5_400, 2, 0b110),
+    "64 × DIG": (64, 5_400, 2, 0b110),
 }
 
 
@@ -36,8 +38,8 @@ def launches() -> Iterator[tuple[str, Pass]]:
     card = Card(multiprocessors=132, shared_bytes=227 * 1024)
     for adjoint in (False, True):
         for real in ("float", "double"):
-            for scene, (particles, bodies, kinds) in SCENES.items():
-                call = Call(adjoint, real, 1, particles, 100, 128, bodies, 4, kinds, muscles=True)
+            for scene, (robots, particles, bodies, kinds) in SCENES.items():
+                call = Call(adjoint, real, robots, particles, 100, 128, bodies, 4, kinds, muscles=True)
                 for one in passes(call, card, lambda kernel, size: card.multiprocessors):
                     yield scene, one
 
@@ -64,7 +66,7 @@ def rows(architectures: list[str]) -> Iterator[dict[str, str]]:
             "precision": "float32" if kernel.real == "float" else "float64",
             "first used by": scene,
             "nodes in": f"shared memory, {one.rows} × {one.columns}" if kernel.shared else "global memory",
-            "threads × particles": f"{kernel.threads} × {kernel.per_thread}",
+            "threads × particles": f"{kernel.threads}" + f" × {kernel.per_thread}" * (not kernel.adjoint),
             "shared memory (KB)": f"{one.shared_bytes / 1024:.1f}",
         }
         for arch in architectures:

@@ -2,14 +2,18 @@
 
 Times are minima over rounds, of a step with random actions, its observation and reward, and of the same with the
 gradient of the smooth reward with respect to the action. With one thread they are processor time, so that other
-programs count less.
+programs count less. Memory is what the first gradient adds at its peak. Every row is measured in a process of its own
+(Linux).
 """
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -26,6 +30,8 @@ class Options:
 
     out: Path
     """Table (CSV)."""
+    tasks: tuple[str, ...] = tuple(dittogym.TASKS)
+    """Tasks."""
     rounds: int = 20
     """Times that each step is measured, after once for warming up."""
     threads: int = 1
@@ -44,8 +50,16 @@ def milliseconds(function: Callable[[], object], options: Options) -> float:
     return 1e3 * min(times)
 
 
-def row(task: str, particles: str, options: Options) -> dict[str, object]:
+def memory(name: str) -> float:
+    """Present (``"VmRSS"``) or peak (``"VmHWM"``) memory of this process, MiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024
+
+
+def row(case: tuple[str, str], options: Options) -> dict[str, object]:
     """What a step of one robot costs."""
+    task, particles = case
+    torch.set_num_threads(options.threads)
     env = dittogym.TorchEnv(task, particles=particles)
     env.reset(seed=0)
     action = torch.rand(1, *env.action_shape, generator=torch.Generator().manual_seed(0)) - 0.5
@@ -58,19 +72,26 @@ def row(task: str, particles: str, options: Options) -> dict[str, object]:
         env.step(leaf, soft=True)[1].sum().backward()
         env.detach()
 
+    forward = milliseconds(step, options)
+    gc.collect()
+    before = memory("VmRSS")
+    gradient()
+    used = memory("VmHWM") - before
     return {
         "task": task,
         "particles": particles,
         "number": f"{env.num_particles:,}",
-        "step, ms": f"{milliseconds(step, options):.1f}",
+        "step, ms": f"{forward:.1f}",
         "with gradient, ms": f"{milliseconds(gradient, options):.1f}",
+        "memory of the gradient, MiB": f"{used:.0f}",
     }
 
 
 def main(options: Options) -> None:
     """Measure and write the table."""
-    torch.set_num_threads(options.threads)
-    rows = [row(task, particles, options) for task in dittogym.TASKS for particles in ("full", "lite")]
+    cases = [(task, particles) for task in options.tasks for particles in ("full", "lite")]
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        rows = pool.map(partial(row, options=options), cases, chunksize=1)
     write_text(options.out, csv_text(rows, list(rows[0])))
 
 

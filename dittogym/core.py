@@ -216,6 +216,11 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
     Raises:
         ValueError: ``action`` is of another shape or type.
     """
+    x, shape = state.particles.x, action.shape if isinstance(action, Tensor) else ()
+    square = len(shape) == 4 and shape[2] == shape[3] <= model.spec.patch
+    if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
+        allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {model.spec.patch}"
+        raise ValueError(f"action must be {allowed}, got {_kind(action)}")
     return evaluate(model, *advance(model, state, action), soft=soft)
 
 
@@ -232,16 +237,8 @@ def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Te
 
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
-
-    Raises:
-        ValueError: ``action`` is of another shape or type.
     """
-    spec, x = model.spec, state.particles.x
-    shape = action.shape if isinstance(action, Tensor) else ()
-    square = len(shape) == 4 and shape[2] == shape[3] <= spec.patch
-    if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
-        allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {spec.patch}"
-        raise ValueError(f"action must be {allowed}, got {_kind(action)}")
+    spec = model.spec
     finite: list[Tensor] = []  # where gradients may go back, known after the step
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:

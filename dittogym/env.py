@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from dittogym.bodies.json_values import to_values
 from dittogym.bodies.positions import MAX_SEED
 from dittogym.render.frame import frame, pace
-from dittogym.render.recording import Recording, as_function, film
+from dittogym.render.recording import Act, Recording, as_function, film
 from dittogym.render.scene import check_size, describe
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
@@ -22,7 +22,6 @@ from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
 from torchmpm import ParticleState, checks
 
-RENDER_MODES = ("rgb_array", "human")
 #: Pictures per second of a video; a control step is 0.01 s, so motion is shown three times slower.
 RENDER_FPS = 30
 
@@ -70,22 +69,44 @@ def first(value: Any) -> Any:
     return {name: entry[0] for name, entry in value.items()} if isinstance(value, dict) else value[0]
 
 
-class JsonSpec:
-    """Stores Gymnasium's ``spec`` with options that `EnvSpec.to_json` can write and from which it can be made again."""
+class Shell:
+    """What both Gymnasium environments have around their :class:`dittogym.TorchEnv`."""
 
+    torch_env: TorchEnv
+    metadata: dict[str, Any]
     _spec: EnvSpec | None = None
+
+    def _set_pictures(self, render_mode: str | None, render_muscles: bool, render_size: int) -> None:
+        modes = self.metadata["render_modes"]
+        if render_mode not in (None, *modes):
+            raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
+        checks.flag("render_muscles", render_muscles)
+        check_size("render_size", render_size)
+        self.render_mode, self.render_muscles, self.render_size = render_mode, render_muscles, render_size
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium made the environment from."""
+        """What Gymnasium made the environment from, with options that JSON can hold."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = spec and replace(spec, kwargs={name: to_values(value) for name, value in spec.kwargs.items()})
 
+    @property
+    def state(self) -> ParticleState:
+        """The particles of all simulations."""
+        return self.torch_env.state
 
-class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
+    def save(self) -> Snapshot:
+        """Return a snapshot, which ``load`` restores; see :meth:`dittogym.TorchEnv.save`."""
+        return self.torch_env.save()
+
+    def _picture(self, index: int) -> np.ndarray:
+        return self.torch_env.render(index, size=self.render_size, muscles=self.render_muscles)
+
+
+class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
 
     Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates itself.
@@ -104,7 +125,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         ImportError: ``render_mode="human"`` without pygame.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}
 
     def __init__(
         self,
@@ -115,27 +136,18 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         render_size: int = 512,
         **options: Any,
     ) -> None:
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
-        checks.flag("render_muscles", render_muscles)
-        check_size("render_size", render_size)
+        self._set_pictures(render_mode, render_muscles, render_size)
         if "num_envs" in options:
             batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")
         self.torch_env = TorchEnv(task, 1, **options)
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
-        self.render_mode, self.render_muscles, self.render_size = render_mode, render_muscles, render_size
         self._screen, self._return = None, 0.0
         if render_mode == "human":
             from dittogym.render.screen import Screen  # pygame is an extra
 
             self._screen = Screen("dittogym: " + self.torch_env.spec.name, RENDER_FPS)
-
-    @property
-    def state(self) -> ParticleState:
-        """The particles, batch of one."""
-        return self.torch_env.state
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -175,10 +187,6 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
         return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
 
-    def save(self) -> Snapshot:
-        """Return a snapshot, which :meth:`load` restores; see :meth:`dittogym.TorchEnv.save`."""
-        return self.torch_env.save()
-
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`; returns its observation (3, 64, 64) uint8.
 
@@ -191,34 +199,23 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """The picture (S, S, 3) uint8 of ``render_size`` S in mode ``"rgb_array"``, else nothing."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self.torch_env.render(size=self.render_size, muscles=self.render_muscles)
+        return self._picture(0) if self.render_mode == "rgb_array" else None
 
     def film(
         self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
     ) -> Recording:
         """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
 
-        Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
-
-        Args:
-            policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
-                ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
-            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Seed of the reset and of the policy's noise.
-            options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
-                and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
-
-        Returns:
-            The recording, from which further films can be saved. A notebook shows it.
+        ``path``, ``seed`` and ``options`` are as there; ``policy`` gets one observation (3, 64, 64) and returns one
+        action (2, R, R). Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with
+        ``env.unwrapped.film``.
         """
+        return film(self.torch_env, self.acting(policy), path, seed, **options)
+
+    def acting(self, policy: Any) -> Act:
+        """A policy of one robot, see :meth:`film`, as a function that the batch of one can be driven by."""
         act = as_function(policy, self.torch_env.action_layout)
-
-        def act_on_batch(images: np.ndarray) -> torch.Tensor:
-            return as_tensor(act(images[0]), self.torch_env, single=True)
-
-        return film(self.torch_env, act_on_batch, path, seed, **options)
+        return lambda images: as_tensor(act(images[0]), self.torch_env, single=True)
 
     def _repr_png_(self) -> bytes | None:
         return self.torch_env._repr_png_()

@@ -69,9 +69,8 @@ class Camera:
         arrays = (x.detach(), v.detach(), origin.detach(), centre.detach())
         if not self.native or x.device.type != "cpu" or transforming():  # torch.func cannot look into the C++ function
             return self.draw(*arrays)
-        bodies = tuple(zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True))
         try:
-            draw = native_drawing(self.view, self.boxes, bodies, self.pixels, x.dtype)
+            draw = native_drawing(self, x.dtype)
         except ValueError as error:  # no compiler, or it failed
             warn_eager("the observation", str(error))
             return self.draw(*arrays)
@@ -337,20 +336,19 @@ class Picture(ctypes.Structure):
 
 
 @functools.lru_cache(maxsize=64)
-def native_drawing(
-    view: Centre, boxes: tuple[Box, ...], bodies: tuple[tuple[int, float, bool], ...], pixels: bool, dtype: torch.dtype
-) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """A function that draws what a :class:`Camera` sees as one C++ call, for tensors on the CPU."""
+def native_drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """A function that draws what a camera sees as one C++ call, for tensors on the CPU."""
     kind = {torch.float32: "float", torch.float64: "double"}[dtype]
     function = getattr(build(_SOURCE, "-ffp-contract=off"), f"dittogym_draw_{kind}")
-    body = torch.tensor(list(bodies), dtype=torch.float64, device="cpu")
-    edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in boxes]
+    bodies = list(zip(camera.counts, camera.particle_weight, camera.hidden_velocity, strict=True))
+    body = torch.tensor(bodies, dtype=torch.float64, device="cpu")
+    edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
     box = torch.tensor(edges, dtype=torch.float64, device="cpu")
     constants = {
-        "pixels": pixels,
+        "pixels": camera.pixels,
         "bodies": len(bodies),
-        "boxes": len(boxes),
-        "view": tuple(math.nan if c is None else c for c in view),
+        "boxes": len(camera.boxes),
+        "view": tuple(math.nan if c is None else c for c in camera.view),
         "margin": GRID.margin,
         "extent": GRID.extent,
         "clip": CLIP,

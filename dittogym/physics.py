@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dittogym.spec import TaskSpec
-from torchmpm import Body, Elastic, VonMises, tree
+from torchmpm import Body, Elastic, VonMises, checks, tree
 
 #: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -19,9 +19,13 @@ Physics: TypeAlias = Mapping[str, Tensor]
 #: What can be set: Lame parameters of the robot and of objects without a material of their own, Pa; yield stress and
 #: muscle limit of the robot, Pa; gravity, m/s^2; and a factor on the mass of all particles.
 NAMES = ("mu", "lam", "yield_stress", "max_actuation", "gravity", "mass")
-_SIGNS = {"mu": "positive", "mass": "positive", "yield_stress": "not negative", "max_actuation": "not negative"}
-#: Largest factor on the mass, far above any use: sums over much heavier particles overflow in float32.
-_LARGEST_MASS = 1e6
+#: What values must be. Sums over particles with a factor of 1e6 on their mass, far above any use, overflow in float32.
+_RANGES: dict[str, dict[str, float]] = {
+    "mu": {"above": 0.0},
+    "yield_stress": {"least": 0.0},
+    "max_actuation": {"least": 0.0},
+    "mass": {"above": 0.0, "below": 1e6},
+}
 #: Those that may differ between the particles of a body.
 PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
@@ -43,8 +47,7 @@ def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor
         like: (B,), gives dtype and device.
 
     Raises:
-        ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite, have a wrong sign, or
-            are too large (mass).
+        ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite or out of range.
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"physics must be a mapping from {', '.join(NAMES)} to values, got {type(given).__name__}")
@@ -58,13 +61,7 @@ def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor
         if tuple(tensor.shape) not in allowed_shapes:
             shapes = " or ".join(map(str, allowed_shapes))
             raise ValueError(f"physics[{name!r}] must have shape {shapes}, got {tuple(tensor.shape)}")
-        sign = _SIGNS.get(name, "")
-        allowed = torch.isfinite(tensor) & ((tensor > 0) if sign == "positive" else (tensor >= 0) | (not sign))
-        if not bool(allowed.all()):
-            kind = f"finite, {sign}" if sign else "finite"
-            raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
-        if name == "mass" and (largest := float(tensor.detach().max())) > _LARGEST_MASS:
-            raise ValueError(f"physics['mass'] must be at most {_LARGEST_MASS:g}, got {largest:g}")
+        checks.entries(f"physics[{name!r}]", tensor, **_RANGES.get(name, {}))
         values[name] = _expanded(tensor, name, batch)
     return values
 

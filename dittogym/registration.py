@@ -14,7 +14,6 @@ from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS, make_spec
 from dittogym.torch_env import TorchEnv
 from dittogym.vector import BatchEnv
-from torchmpm import checks
 
 #: The tasks of the library, whose names stay theirs.
 LIBRARY = dict(TASKS)
@@ -23,21 +22,19 @@ _SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 TAKEN = {name for taker in (TorchEnv, Env, BatchEnv, make_spec) for name in inspect.signature(taker).parameters}
 
 
-def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
+def register(task: str, make: Callable[..., TaskSpec]) -> None:
     """Register a task by name for :class:`dittogym.TorchEnv` and, in both resolutions, for Gymnasium.
 
     A name that is registered again, as in a notebook's cell that is run twice, stands for the later function.
 
     Args:
-        task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
+        task: Its name; the ids are ``dittogym/{task}-coarse-v0`` and ``dittogym/{task}-fine-v0``.
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
             Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` too.
-        namespace: Namespace of the ids.
-        version: Increase it with every change of behaviour.
 
     Raises:
         ValueError: The name is that of a task of the library, differs from that in the specification or is not one
-            word, an argument of ``make`` is one of the environments too, or the version is not a whole number.
+            word, or an argument of ``make`` is one of the environments too.
         TypeError: ``make`` is not a function without required arguments that returns a :class:`dittogym.TaskSpec`.
 
     Examples:
@@ -50,17 +47,12 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
-    if not isinstance(namespace, str) or re.fullmatch(r"[\w-]+", namespace) is None:
-        raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
-    version = checks.whole("version", version, 0)
     if LIBRARY.get(task, make) is not make:
         raise ValueError(f"task must be a name that no task of the library has, got {task!r}")
     if not callable(make):
         raise TypeError(f"make must be a function that returns a TaskSpec, got {type(make).__name__}")
-    own = {name: each for name, each in inspect.signature(make).parameters.items() if each.kind not in _SEVERAL}
-    if bare := [name for name, each in own.items() if each.default is each.empty]:
-        raise TypeError(f"make must have defaults for all its arguments, got none for {', '.join(bare)}")
-    if taken := sorted(TAKEN & own.keys()):
+    own = {name for name, each in inspect.signature(make).parameters.items() if each.kind not in _SEVERAL}
+    if taken := sorted(TAKEN & own):
         raise ValueError(f"make must have arguments of other names than the environments', got {', '.join(taken)}")
     spec = make()
     if not isinstance(spec, TaskSpec):
@@ -68,7 +60,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     if spec.name != task:
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
     for resolution in ("coarse", "fine"):
-        name = f"{namespace}/{task}-{resolution}-v{version}"
+        name = f"dittogym/{task}-{resolution}-v0"
         gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that are replaced
         gymnasium.register(
             id=name,

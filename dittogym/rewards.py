@@ -143,13 +143,13 @@ class RewardOps:
         if low is not None and high is not None and low > high:
             raise ValueError(f"low must be at most high, {high}, got {low}")
         limits = [(limit, sign) for limit, sign in ((high, 1.0), (low, -1.0)) if limit is not None]
+        largest = max((abs(limit) for limit, _ in limits), default=0.0)
         if width is not None and not width > 0:
             raise ValueError(f"width must be positive, got {width!r}")
-        if width is None and limits and not any(limit for limit, _ in limits):
+        if width is None and limits and not largest:
             raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
         if not self.smooth:
             return z.clamp(low, high) if limits else z
-        largest = max((abs(limit) for limit, _ in limits), default=0.0)
         for limit, sign in limits:
             w = width or RELATIVE_WIDTH * (abs(limit) or largest)
             z = z - sign * w * softplus(sign * (z - limit) / w)

@@ -21,13 +21,11 @@ class Snapshot:
     """A saved state of an environment, see :meth:`dittogym.TorchEnv.save`.
 
     Attributes:
-        kind: See :func:`kind_of`.
         state: Everything that moves.
         observation: (B, 3, 64, 64) uint8.
-        constants: What else the environment that loads it must share, see :func:`constants_of`.
+        constants: What the environment that loads it must share, see :func:`constants_of`.
     """
 
-    kind: tuple[str, tuple[int, ...], tuple[float, ...]]
     state: EnvState
     observation: Tensor
     constants: Mapping[str, str]
@@ -36,19 +34,20 @@ class Snapshot:
 torch.serialization.add_safe_globals([Snapshot, EnvState, Features])  # tensors, numbers and a name
 
 
-def kind_of(model: Model) -> tuple[str, tuple[int, ...], tuple[float, ...]]:
-    """The task's name, the particles of each body, and the full-size particles that one of them stands for."""
-    return model.spec.name, model.camera.counts, model.camera.particle_weight
-
-
-def constants_of(model: Model) -> dict[str, str]:
+def constants_of(model: Model, like: Tensor) -> dict[str, str]:
     """By name what determines an episode besides its state, as texts that are equal for equal values.
 
     Tensors that require gradients are identified by their shape alone, because training changes their values.
+
+    Args:
+        model: The task.
+        like: Gives dtype and device.
     """
-    names = [each.name for each in fields(model.spec) if each.name not in ("coarse", "fine")]
-    spec = {name: _as_text(getattr(model.spec, name)) for name in names}
-    return {**spec, "substeps": str(model.substeps), "dt": str(model.solver.dt)}
+    spec, camera = model.spec, model.camera
+    values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.name not in ("coarse", "fine")}
+    own = {"substeps": model.substeps, "dt": model.solver.dt, "dtype": like.dtype, "device": like.device}
+    own |= {"particles": camera.counts, "particle weights": camera.particle_weight}
+    return {name: _as_text(value) for name, value in ({"task": values.pop("name")} | own | values).items()}
 
 
 def _as_text(value: Any) -> str:
@@ -70,15 +69,9 @@ def _as_text(value: Any) -> str:
     return type(value).__name__ if " at 0x" in text else text  # an address differs in another process
 
 
-def check_snapshot(snapshot: Snapshot, model: Model, constants: Mapping[str, str], like: Tensor) -> None:
-    """Refuse a snapshot that does not fit the model and B simulations of dtype and device of ``like`` (B,)."""
-    x, size = snapshot.state.particles.x, len(snapshot.state.steps)
-    if size not in (1, len(like)):
-        raise ValueError(f"snapshot must hold 1 simulation or as many as num_envs, {len(like)}, got {size}")
-    own, theirs = (*kind_of(model), like.dtype, like.device), (*snapshot.kind, x.dtype, x.device)
-    names = "task", "particles", "particle weights", "dtype", "device"
-    for name, mine, given in zip(names, own, theirs, strict=True):
-        if mine != given:
-            raise ValueError(f"snapshot must have the environment's {name}, {mine}, got {given}")
+def check_snapshot(snapshot: Snapshot, constants: Mapping[str, str], num_envs: int) -> None:
+    """Refuse a snapshot that does not fit an environment with these constants and ``num_envs`` simulations."""
+    if (size := len(snapshot.state.steps)) not in (1, num_envs):
+        raise ValueError(f"snapshot must hold 1 simulation or as many as num_envs, {num_envs}, got {size}")
     if others := [name for name, text in constants.items() if snapshot.constants.get(name) != text]:
         raise ValueError(f"snapshot must be of an environment with the same {', '.join(others)}, got another")

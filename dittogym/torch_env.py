@@ -24,7 +24,7 @@ from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import QUANTITIES, Shot, describe, take
 from dittogym.rewards import features_of
-from dittogym.snapshots import Snapshot, check_snapshot, constants_of, kind_of
+from dittogym.snapshots import Snapshot, check_snapshot, constants_of
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
@@ -32,8 +32,6 @@ from torchmpm.checks import Segment
 from torchmpm.tree import transforming
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-#: Substeps in a control step, far above any use.
-MOST_SUBSTEPS = 1_000_000
 RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
@@ -120,7 +118,8 @@ class TorchEnv:
         random = self.model.camera.pixels  # with full counts, both as in the reference
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
-        core.check_rewards(self.model, self._initial_positions.even(2, self._like))
+        trial = InitialPositions(self.spec, counts, 2, random=False, resample=False)
+        core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
@@ -183,19 +182,18 @@ class TorchEnv:
             self._observation = core.observe(self.model, self.env_state)
         return self._observation
 
-    def detach(self, *, physics: bool = True) -> None:
-        """Detach the state from the autograd graph, with ``physics=False`` except for the physics of the last reset."""
-        state = tree.detach(self.env_state)
-        self._env_state = state if physics else replace(state, physics=self.env_state.physics)
+    def detach(self) -> None:
+        """Detach the state, and the physics of the last reset, from the autograd graph."""
+        self._env_state = tree.detach(self.env_state)
 
     def save(self) -> Snapshot:
         """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self.observation()))
-        return Snapshot(kind_of(self.model), state, observation, self._constants)
+        return Snapshot(state, observation, self._constants)
 
     @functools.cached_property
     def _constants(self) -> dict[str, str]:
-        return constants_of(self.model)
+        return constants_of(self.model, self._like)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Restore a snapshot; the simulation continues bit for bit as it did before.
@@ -215,7 +213,7 @@ class TorchEnv:
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        check_snapshot(snapshot, self.model, self._constants, self._like)
+        check_snapshot(snapshot, self._constants, self.num_envs)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
@@ -263,11 +261,8 @@ class TorchEnv:
             physics = merged(self.spec, physics, values, mask, self._like)
             core.check_stability(self.model, physics)
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
-        assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
-        # Indexing saves the index for the backward pass, which `detach(physics=False)` would make impossible to repeat.
-        own = tree.map(lambda t: t[index], physics) if len(index) < self.num_envs else physics
-        fresh, observation = core.reset(self.model, drawn.positions[index], own)
+        fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
         info = core.info_of(self.model, fresh, fresh.start)
         if len(index) < self.num_envs:
             old = self.env_state
@@ -306,10 +301,9 @@ class TorchEnv:
                 "TorchEnv.step must not be called in a backward pass, as torch.utils.checkpoint does to repeat a step "
                 "from the state after it: use dittogym.core.step with its model, which keeps nothing"
             )
-        if not isinstance(soft, bool):
-            raise ValueError(f"soft must be True or False, got {soft!r}")
+        checks.flag("soft", soft)
         action = to_grid_layout(self._checked(action), self.action_layout)
-        result = core.step(self.model, self.env_state, action, soft=soft)
+        result = core.evaluate(self.model, *core.advance(self.model, self.env_state, action), soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
@@ -369,7 +363,7 @@ class TorchEnv:
             seed: Seed of the reset and, if it is not ``None``, of the policy's noise.
             index: Which element of the batch.
             options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
-                and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+                and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
 
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
@@ -398,12 +392,10 @@ def find_substeps(dt: float, substeps: int | None) -> int:
     """Substeps of ``dt`` s in a control step; ``None`` stands for as many as take :data:`CONTROL_STEP`."""
     checks.number("dt", dt, above=0.0)
     if substeps is not None:
-        return checks.whole("substeps", substeps, 1, MOST_SUBSTEPS)
-    ratio = CONTROL_STEP / dt
-    count = round(ratio) if ratio <= MOST_SUBSTEPS else 0
+        return checks.whole("substeps", substeps, 1)
+    count = round(CONTROL_STEP / dt)
     if not math.isclose(count * dt, CONTROL_STEP):
-        problem = f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}"
-        raise ValueError(f"{problem}; there may be at most {MOST_SUBSTEPS} substeps")
+        raise ValueError(f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}")
     return count
 
 

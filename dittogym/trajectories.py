@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from dittogym.bodies.positions import MAX_SEED
-from dittogym.env import Env, as_tensor
+from dittogym.env import Env
 from dittogym.files import replacing
 from dittogym.render.recording import as_function, play
 from dittogym.torch_env import TorchEnv
@@ -79,10 +79,7 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
         raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
     if unknown := [name for name in fields if name not in FIELDS]:
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
-    choose, single = as_function(policy, torch_env.action_layout), isinstance(inner, Env)
-
-    def act(images: np.ndarray) -> Any:
-        return as_tensor(choose(images[0]), torch_env, single=True) if single else choose(images)
+    act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env.action_layout)
 
     def state() -> list[np.ndarray]:
         return [getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields]

@@ -13,13 +13,12 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.env import RENDER_FPS, RENDER_MODES, JsonSpec, as_numpy, as_tensor, spaces
-from dittogym.render.scene import check_size
+from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, spaces
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
-from torchmpm import ParticleState, checks
+from torchmpm import checks
 
 
 class AutoresetStep(NamedTuple):
@@ -35,7 +34,7 @@ class AutoresetStep(NamedTuple):
     reset_info: dict[str, Any] | None  # Of all elements after the reset; None if no episode ended
 
 
-def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | Tensor | None = None) -> AutoresetStep:
+def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | Tensor | None) -> AutoresetStep:
     """Step all elements, and reset those whose episode has ended; ``max_episode_steps`` may differ, (B,)."""
     observation, reward, terminated, truncated, info = env.step(action)
     if max_episode_steps is not None:
@@ -47,7 +46,7 @@ def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | Tensor |
     return AutoresetStep(observation, final_observation, reward, terminated, truncated, done, info, reset_info)
 
 
-class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` simulations behind Gymnasium's vector interface.
 
     Args:
@@ -74,7 +73,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ((3, 3, 64, 64), (3,), (3,))
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES[:1]), "render_fps": RENDER_FPS}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}
 
     def __init__(
         self,
@@ -88,10 +87,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
-        if render_mode not in (None, RENDER_MODES[0]):
-            raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
-        checks.flag("render_muscles", render_muscles)
-        check_size("render_size", render_size)
+        self._set_pictures(render_mode, render_muscles, render_size)
         if max_episode_steps not in (None, -1):
             checks.whole("max_episode_steps", max_episode_steps, 1)
         try:
@@ -101,8 +97,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}") from error
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.render_muscles, self.render_size = render_muscles, render_size
+        self.num_envs = num_envs
         own, usual = self.torch_env.spec.horizon, make_spec(task).horizon
         # Gymnasium passes the limit of the id, whatever the task's options say.
         limit = own if max_episode_steps in (None, usual) else max_episode_steps
@@ -111,11 +106,6 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
-
-    @property
-    def state(self) -> ParticleState:
-        """The particles of all simulations."""
-        return self.torch_env.state
 
     @torch.no_grad()
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -151,14 +141,15 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return self._step_then_reset(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
         rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
-        images, info = as_numpy(step.observation), as_numpy(step.info)
-        if step.reset_info is None:
-            return images, rewards, ends, limits, _with_masks(info, np.ones_like(ends))
-        done, finals, final = _array(step.done), as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
-        for i in np.flatnonzero(done):
-            final[i] = finals[i]
-        last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
-        return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
+        images, info, done = as_numpy(step.observation), as_numpy(step.info), _array(step.done)
+        result = _restarted(info, as_numpy(step.reset_info or {}), done)
+        if done.any():
+            finals, final = as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
+            for i in np.flatnonzero(done):
+                final[i] = finals[i]
+            result |= {"final_obs": final, "_final_obs": done}
+            result |= {"final_info": _with_masks(info, done), "_final_info": done}
+        return images, rewards, ends, limits, result
 
     def _step_then_reset(self, action: torch.Tensor) -> tuple[Any, ...]:
         """A step after which, in the mode ``NEXT_STEP``, elements that had ended before it are reset."""
@@ -174,10 +165,6 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if fresh.any():
             observation, start = self.torch_env.reset(options={"reset_mask": ended})
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
-
-    def save(self) -> Snapshot:
-        """Return a snapshot of all simulations; see :meth:`dittogym.TorchEnv.save`."""
-        return self.torch_env.save()
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
         """Restore a snapshot; an element that was to be reset continues instead.
@@ -195,10 +182,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (S, S, 3) uint8 of ``render_size`` S of each simulation in mode ``"rgb_array"``, else nothing."""
-        if self.render_mode is None:
-            return None
-        options: dict[str, Any] = {"size": self.render_size, "muscles": self.render_muscles}
-        return tuple(self.torch_env.render(i, **options) for i in range(self.num_envs))
+        return None if self.render_mode is None else tuple(map(self._picture, range(self.num_envs)))
 
 
 def _array(values: Any) -> np.ndarray:

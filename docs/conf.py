@@ -70,7 +70,7 @@ napoleon_use_ivar = True
 
 
 class CommandHelp(SphinxDirective):
-    """Show the output of ``python -m MODULE OPTIONS --help``, so that the page is always up to date."""
+    """Show the output of ``torchmpm PROGRAM OPTIONS --help``, so that the page is always up to date."""
 
     required_arguments = 1
     final_argument_whitespace = True
@@ -79,10 +79,10 @@ class CommandHelp(SphinxDirective):
         """Run the command and show its output as a literal block."""
         self.env.note_reread()  # the program may have changed even if the page has not
         environment = os.environ | {"COLUMNS": "88", "NO_COLOR": "1", "TERM": "dumb"}
-        command = [sys.executable, "-m", *self.arguments[0].split(), "--help"]
+        command = [sys.executable, "-m", "baselines.console", *self.arguments[0].split(), "--help"]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
-            raise self.error(f"python -m {self.arguments[0]} --help failed:\n{done.stderr}")
+            raise self.error(f"torchmpm {self.arguments[0]} --help failed:\n{done.stderr}")
         return [nodes.literal_block(text=done.stdout)]
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import dittogym
 from baselines.compare import paper
 from dittogym.bodies.positions import particle_counts
-from dittogym.geometry import Obstacle
+from dittogym.geometry import Box, Obstacle
 from dittogym.spec import BodySpec
 from dittogym.tasks import headline
 from torchmpm import Snow
@@ -27,7 +27,17 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 OBSERVES = ("image", "state", "simulator", "nothing")
 BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -->)")
-WAYS = {"+x": "right", "-x": "left", "+y": "up", "-y": "down"}
+INF = math.inf
+#: Where algorithms say what they log.
+METRICS = {
+    "all": ("cfp.experiment.callbacks.LOG_METRICS", "cfp.experiment.callbacks.EVALUATION_METRICS"),
+    "`cfp-analytic`": ("cfp.analytic.learner.METRICS",),
+    "`cfp-sac`": ("cfp.sac.learner.METRICS",),
+    "`shac`": ("baselines.shac.METRICS",),
+    "`distill`": ("baselines.distillation.learner.METRICS",),
+    "`gradient`": ("baselines.trajectory.METRICS",),
+    "`mpc`, `cem`": ("baselines.planning.mpc.METRICS",),
+}
 Row = dict[str, str]
 
 
@@ -110,8 +120,8 @@ def results() -> str:
                 f"{number(training['steps'])} / {paper.STEPS[task]:,}",
             ]
         )
-    ours = ("this package", "success", "paper's CFP", "minutes on one core", "steps, here / in the paper")
-    return markdown(("", "zero actions", "random actions", *ours), rows)
+    names = ("zero actions", "random actions", "this package", "success", "paper's CFP", "minutes on one core")
+    return markdown(("", *names, "steps, here / in the paper"), rows)
 
 
 def planning() -> str:
@@ -135,13 +145,13 @@ def planning() -> str:
     )
 
 
-def returns(particles: str) -> str:
-    """Mean returns of all algorithms in all tasks with some particles, from the evaluations with the most episodes."""
+def returns() -> str:
+    """Mean returns of all algorithms in all tasks with full particles, from the evaluations with the most episodes."""
     cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in (*policies(), *read("returns.csv")):
         label = re.sub(r" --learning-rate.*`|, .*", "`", row["algorithm"]).replace(f'("{row["task"]}")', "(task)")
         label = "`distill`" if "distill" in row["algorithm"] else label.replace("``", "`").strip()
-        if row["particles"] == particles and "target" not in row["algorithm"]:
+        if row["particles"] == "full" and "target" not in row["algorithm"]:
             cells.setdefault((row["observes"], label), {}).setdefault(row["task"], []).append(row)
 
     def cell(rows: list[Row]) -> str:
@@ -177,34 +187,30 @@ def leaderboard() -> str:
     return markdown(("Task", "Policies"), ([name_of(task), "; ".join(found)] for task, found in rows.items() if found))
 
 
+def pivot(
+    rows: Iterable[Row], index: Sequence[str], columns: Sequence[str], value: str
+) -> tuple[list[tuple[str, ...]], list[list[str]]]:
+    """Heads and lines of a table that has a line for each value of some columns and a cell for each of others."""
+    lines: dict[tuple[str, ...], dict[tuple[str, ...], str]] = {}
+    for row in rows:
+        lines.setdefault(tuple(row[key] for key in index), {})[tuple(row[key] for key in columns)] = row[value]
+    heads = sorted({head for line in lines.values() for head in line})
+    return heads, [[*key, *(line.get(head, "") for head in heads)] for key, line in lines.items()]
+
+
 def ablation_gradients() -> str:
     """Final returns of the learner from gradients while one option is changed at a time, on SHAPE MATCH."""
     rows = [row for row in read("analytic-shapematch.csv") if row["final"]]
-    found = {(row["part"], row["value"], row["seed"]): row for row in rows}
-    names = [(row["part"], row["value"]) for row in sorted(rows, key=lambda row: -int(row["final"]))]
-    return markdown(
-        ("Changed", "To", "Return, seed 0", "Return, seed 1"),
-        (
-            [part, value]
-            + [found[key]["final"] if (key := (part, value, seed)) in found else "" for seed in ("0", "1")]
-            for part, value in dict.fromkeys(names)
-        ),
-    )
+    rows.sort(key=lambda row: -int(row["final"]))
+    _, lines = pivot(rows, ("part", "value"), ("seed",), "final")
+    return markdown(("Changed", "To", "Return, seed 0", "Return, seed 1"), lines)
 
 
 def ablation_rewards() -> str:
     """Returns of the learner from rewards with each option left out, over ten episodes."""
-    rows = [row for row in read("rewards-ablation.csv") if row["episodes"]]
-    found = {(row["change"], row["task"], row["seed"]): number(row["mean"]) for row in rows}
-    columns = [(task, seed) for task in ("run", "shapematch") for seed in sorted({row["seed"] for row in rows})]
-    columns = [column for column in columns if any((row["task"], row["seed"]) == column for row in rows)]
-    return markdown(
-        ("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in columns)),
-        (
-            [change, *(found.get((change, *column), "") for column in columns)]
-            for change in dict.fromkeys(row["change"] for row in rows)
-        ),
-    )
+    rows = [row | {"mean": number(row["mean"])} for row in read("rewards-ablation.csv") if row["episodes"]]
+    heads, lines = pivot(rows, ("change",), ("task", "seed"), "mean")
+    return markdown(("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in heads)), lines)
 
 
 def best_rewards() -> str:
@@ -215,6 +221,15 @@ def best_rewards() -> str:
         ("", *map(name_of, tasks)),
         [["return, seeds 0, 1, ...", *(", ".join(number(r["mean"]) for r in rows if r["task"] == t) for t in tasks)]],
     )
+
+
+def costs() -> str:
+    """Cost of a step of every task, with full and with lite particles."""
+    rows = read("task-costs.csv")
+    columns = list(rows[0])[2:]  # after the task and the name of the particle count
+    pairs = zip(rows[::2], rows[1::2], strict=True)
+    lines = ([name_of(full["task"]), *(f"{full[key]} / {lite[key]}" for key in columns)] for full, lite in pairs)
+    return markdown(("task", "particles", *columns[1:]), lines)
 
 
 def gpu_run() -> dict[str, Any]:
@@ -265,10 +280,35 @@ def from_csv(name: str) -> str:
     return markdown(list(rows[0]), (list(row.values()) for row in rows))
 
 
-def names(*paths: str) -> str:
-    """Names and their meanings, from dictionaries ``package.module.NAME``."""
-    found = {key: meaning for path in paths for key, meaning in pkgutil.resolve_name(path).items()}
-    return markdown(("Name", "Meaning"), ([f"`{key}`", meaning] for key, meaning in found.items()))
+def verification() -> str:
+    """Errors of the solver, with a row for each problem."""
+    problems: dict[str, list[Row]] = {}
+    for row in read("verification.csv"):
+        problems.setdefault(row["problem"], []).append(row)
+
+    def listed(rows: list[Row], column: str) -> str:
+        return ", ".join(row[column] for row in rows if row[column])
+
+    def sizes(rows: list[Row]) -> str:
+        return f"{', '.join(row['size'].split()[0] for row in rows)} {rows[0]['size'].partition(' ')[2]}"
+
+    return markdown(
+        ("Problem", "Sizes", "Errors", "Orders"),
+        ([name, sizes(rows), listed(rows, "error"), listed(rows, "order")] for name, rows in problems.items()),
+    )
+
+
+def metrics() -> str:
+    """What trainings log, and which algorithms log it."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for algorithms, paths in METRICS.items():
+        for path in paths:
+            for key, meaning in pkgutil.resolve_name(path).items():
+                found.setdefault((key, meaning), []).append(algorithms)
+    return markdown(
+        ("Name", "Algorithms", "Meaning"),
+        ([f"`{key}`", ", ".join(algorithms), meaning] for (key, meaning), algorithms in found.items()),
+    )
 
 
 # Tasks
@@ -323,38 +363,40 @@ def constants(task: str) -> str:
 
 
 def geometry(task: str) -> str:
-    """Obstacles of a task: name, visibility and velocity rules."""
+    """Obstacles of a task: name, visibility, friction and edges."""
     return markdown(
-        ("Obstacle", "In the observation", "Matter cannot move"),
+        ("Obstacle", "In the observation", "Friction", "Edges, nodes"),
         (
-            [obstacle.name, "yes" if obstacle.observed_boxes else "no", "; ".join(rules(obstacle))]
+            [
+                obstacle.name,
+                "yes" if obstacle.observed_boxes else "no",
+                friction(obstacle),
+                "; ".join(map(extent, obstacle.boxes)) or "the edges of the window",
+            ]
             for obstacle in dittogym.make_spec(task).obstacles
         ),
     )
 
 
-def rules(obstacle: Obstacle) -> list[str]:
-    """What an obstacle does to matter, in words."""
-    ways: dict[str, list[str]] = {}
-    for rule in obstacle.velocity_rules:
-        place = ", ".join(
-            f"{axis} {extent(*ends)}" for axis, ends in (("i", rule.i), ("j", rule.j)) if ends != (None, None)
-        )
-        friction = " without slip" if math.isinf(rule.friction) else f" with friction {rule.friction:g}"
-        where = f"{place or 'anywhere'}{' of the window' * (rule.frame == 'window')}"
-        way = WAYS[rule.direction] + (friction if rule.friction else "")
-        ways.setdefault(where, [])
-        ways[where] += [way] * (way not in ways[where])
-    return [f"{'at all' if len(found) == 4 else ' or '.join(found)} at {where}" for where, found in ways.items()]
+def friction(obstacle: Obstacle) -> str:
+    """Friction of an obstacle; in the tasks only an upper side has any."""
+    found = {rule.friction for rule in obstacle.velocity_rules}
+    if math.inf not in found:
+        return "none"
+    return "no slip" if found == {math.inf} else "no slip on top"
 
 
-def extent(low: int | None, high: int | None) -> str:
-    """An inclusive range of nodes."""
-    if low is None:
-        return f"≤ {high}"
-    if high is None:
-        return f"≥ {low}"
-    return f"{low}" if low == high else f"{low} … {high}"
+def extent(box: Box) -> str:
+    """Edges of a box in coordinates of nodes."""
+    sides = (("i", box.left, box.right), ("j", box.bottom, box.top))
+    return ", ".join(f"{axis} {span(128 * low, 128 * high)}" for axis, low, high in sides if low > -INF or high < INF)
+
+
+def span(low: float, high: float) -> str:
+    """A range."""
+    if low == -INF:
+        return f"≤ {high:g}"
+    return f"≥ {low:g}" if high == INF else f"{low:g} … {high:g}"
 
 
 TABLES: dict[str, Callable[..., str]] = {
@@ -362,25 +404,28 @@ TABLES: dict[str, Callable[..., str]] = {
     "ablation-rewards": ablation_rewards,
     "best-rewards": best_rewards,
     "constants": constants,
+    "costs": costs,
     "csv": from_csv,
     "cuda-kernels": cuda_kernels,
     "geometry": geometry,
     "gpu": gpu,
     "gpu-line": gpu_line,
     "leaderboard": leaderboard,
-    "names": names,
+    "metrics": metrics,
     "planning": planning,
     "published": published,
     "results": results,
     "returns": returns,
     "tasks": tasks,
+    "verification": verification,
 }
 
 
 def pages() -> list[Path]:
     """Pages that contain tables."""
     built = {"_build", "gallery"}
-    found = [ROOT / "README.md", *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
+    own = (ROOT / "README.md", ROOT / "benchmarks/README.md")
+    found = [*own, *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
     return [path for path in sorted(found) if BLOCK.search(path.read_text())]
 
 

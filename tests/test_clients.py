@@ -27,7 +27,7 @@ FAST = {"sb3_ppo"}
 
 
 def test_every_script_is_tested_and_shown() -> None:
-    page = (ROOT / "docs/clients.md").read_text()
+    page = (ROOT / "docs/tasks.md").read_text()
     scripts = {path.stem for path in (ROOT / "examples/clients").glob("*.py")}
     assert scripts == set(SCRIPTS) == set(re.findall(r"\]\(\.\./examples/clients/(\w+)\.py", page))
 

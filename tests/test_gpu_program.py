@@ -3,10 +3,14 @@
 import importlib.util
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from torchmpm.backends import compiler_found
 
 PROGRAM = Path(__file__).resolve().parents[1] / "benchmarks/gpu.py"
 spec = importlib.util.spec_from_file_location("gpu_program", PROGRAM)
@@ -91,3 +95,31 @@ def test_no_check_runs_in_a_context_that_is_lost(monkeypatch, capsys):
 def test_a_figure_beyond_its_bound_or_no_number_is_wrong(value):
     assert len(gpu.judged({"x": value}, {"x": 1.0})["wrong"]) == 1
     assert gpu.judged({"x": 1.0}, {"x": 1.0})["wrong"] == []
+
+
+needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize("stage", ["card", "paper"])
+def test_a_stage_on_the_imitation(stage, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with gpu.imitation():
+        assert gpu.run_stage(gpu.Lab("cpu", True, tmp_path, 60.0), stage, 0) == 0
+    (row,) = [json.loads(line[4:]) for line in capsys.readouterr().out.splitlines() if line.startswith("ROW ")]
+    assert row["wrong"] == [] and row["backend"] == {"card": None, "paper": "native"}[stage]
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="it would run on the GPU")
+def test_all_stages_on_the_imitation(tmp_path):
+    """None of them fails, and nothing is written where the results of GPUs are."""
+    before = sorted(gpu.RESULTS.glob("*"))
+    command = [sys.executable, str(PROGRAM), "--out", str(tmp_path / "results.json"), "--seconds", "900"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert found["device"] == "imitation" and {row["stage"] for row in found["rows"]} == set(gpu.STAGES)
+    assert f"{len(found['rows'])} checks, 0 failed" in done.stdout
+    assert sorted(gpu.RESULTS.glob("*")) == before

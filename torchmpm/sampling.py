@@ -1,7 +1,7 @@
 """Particle positions in simple shapes, from numbers that the caller supplies.
 
-Each shape is a map of the unit square: give it ``uniform(count, generator)`` for random, ``sobol(count, seed)`` for
-evenly spread particles. No function here touches a global generator.
+Each shape is a map of the unit square: give it ``generator.random((count, 2))`` of NumPy for random particles,
+``sobol(count, seed)`` for evenly spread ones. No function here touches a global generator.
 """
 
 import math
@@ -17,21 +17,6 @@ from torchmpm.tree import transforming
 Points = NDArray[np.float64]
 #: Most points that are made at once; a Sobol sequence of torch has no more.
 LARGEST = 2**30
-
-
-def uniform(count: int, generator: np.random.Generator) -> Points:
-    """Independent points (N, 2) of the unit square.
-
-    Args:
-        count: N, at least 1.
-        generator: Where they are drawn from.
-
-    Raises:
-        ValueError: ``count`` is not a whole number above 0.
-        TypeError: ``generator`` is not a :class:`numpy.random.Generator`.
-    """
-    checks.instance("generator", generator, np.random.Generator)
-    return generator.random((checks.whole("count", count, 1), 2))
 
 
 def sobol(count: int, seed: int) -> Points:

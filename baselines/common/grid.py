@@ -25,7 +25,7 @@ def find_grid(option: str, task: str, grid: Grid) -> int:
 def long_dt(task: str) -> float | None:
     """Duration of a substep, s, for gradient methods and planners; None: as in the environment.
 
-    Twice the usual one where that changes no more than another layout of particles does (benchmarks/long_substeps.py).
+    Twice the usual one where that changes no more than another layout of particles does (docs/concepts/fidelity.md).
     """
     return 2e-4 if task == "run" else None
 

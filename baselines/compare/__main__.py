@@ -22,8 +22,6 @@ EXAMPLES = (
     "--tasks run kick --algos zero gradient --out runs/gradient --workers 2",
     "--tasks run kick --algos zero gradient --out runs/gradient --report-only",
 )
-#: Seconds to wait for another process that holds a run; file servers take a while to give up a lost machine.
-WAIT, CLUSTER_WAIT = 30.0, 300.0
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,6 @@ class Command:
     """Cores of a run; if not given, an equal share of this machine's for each worker, or 1 on a cluster."""
     gpus_per_run: float = 0.0
     """Ray: GPUs of a run, also a fraction of one."""
-    retries: int = 2
-    """Number of times that a run is restarted after its process or node was lost."""
     executor: Literal["local", "ray"] = "local"
     """Processes of this machine, or tasks of a Ray cluster."""
     address: str | None = None
@@ -82,7 +78,7 @@ class Command:
     def check(self) -> None:
         """Check what the types cannot."""
         check_at_least(1, episodes=self.episodes, workers=self.workers)
-        check_at_least(0, gpus_per_run=self.gpus_per_run, retries=self.retries)
+        check_at_least(0, gpus_per_run=self.gpus_per_run)
         if self.cpus_per_run is not None:
             check_at_least(1, cpus_per_run=self.cpus_per_run)
         if not isinstance(self.particles, str):
@@ -96,13 +92,10 @@ class Command:
     def make_executor(self) -> LocalExecutor | RayExecutor:
         """What carries out the runs."""
         if self.executor == "ray":
-            return RayExecutor(
-                self.address, Resources(self.cpus_per_run or 1, self.gpus_per_run, self.retries, CLUSTER_WAIT)
-            )
+            return RayExecutor(self.address, Resources(self.cpus_per_run or 1, self.gpus_per_run))
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         threads = self.cpus_per_run or max(1, available // self.workers)
-        wait = WAIT if self.only is None else CLUSTER_WAIT
-        return LocalExecutor(self.workers, Resources(threads, retries=self.retries, wait=wait))
+        return LocalExecutor(self.workers, Resources(threads))
 
 
 def compare(command: Command) -> int:
@@ -146,11 +139,9 @@ def compare(command: Command) -> int:
         print("stopped; the same command resumes the comparison")
         return 130
     finally:
-        code = (
-            _report(command, runs, protocol)
-            if command.only is None
-            else int(any(each != "finished" for each in outcomes))
-        )
+        code = int(any(each != "finished" for each in outcomes))
+        if command.only is None:
+            code = _report(command, runs, protocol)
     return code
 
 

@@ -11,15 +11,12 @@ import baselines
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare import paper
 from baselines.compare.plan import Run, reference_config
-from baselines.registry import configure, sees
+from baselines.registry import sees
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.evaluation.returns import Played, evaluation_seed, make_trial, play
 from cfp.policy import Policy
 from cfp.registry import algo_of
-
-#: Episodes after which an evaluation is written down, so that one that is stopped goes on from there.
-BATCH = 10
 
 
 @dataclass(frozen=True)
@@ -49,45 +46,44 @@ def identity(run: Run) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 
+def conditions(run: Run, protocol: Protocol) -> dict[str, Any]:
+    """What must be the same for an evaluation to count."""
+    noise = not protocol.deterministic(run.task)
+    own = {"episodes": protocol.episodes, "particles": protocol.particles, "noise": noise}
+    return {"policy": identity(run), **own}
+
+
 def evaluate_run(run: Run, protocol: Protocol) -> None:
-    """Evaluate the policy of a run as far as its record does not hold that yet.
+    """Evaluate the policy of a run and put the result into its record.
 
     The layouts are the same for the runs of all seeds: those on which no run of a comparison trains or chooses.
     """
-    device = choose_device(run.options["device"])
     if run.reference:
-        config = configure(reference_config(run.options))
+        config = reference_config(run.options)
         policy, observes = REFERENCE_POLICIES[run.options["algo"]](config), "nothing"
     else:
         there = baselines.Run(run.folder)
-        config, policy, about = there.config, there.policy, there.policy.description
-        observes = about.get("sees", sees(algo_of(about)))
+        config, policy = there.config, there.policy
+        observes = sees(algo_of(policy.description))
+    device = choose_device(run.options["device"])
     config = replace(config, seed=0, device=device, particles=protocol.particles)
     deterministic = protocol.deterministic(run.task)
-    conditions = {"policy": identity(run), "particles": protocol.particles, "noise": not deterministic}
-    found = run.record.get("evaluation", {})
-    if any(found.get(name) != value for name, value in conditions.items()):
-        found = {**conditions, "observes": observes, "layouts": [], "returns": [], "successes": [], "own_layout": None}
-    while (done := len(found["returns"])) < protocol.episodes:
-        first = evaluation_seed(config) + done
-        layouts = range(first, first + min(BATCH, protocol.episodes - done))
-        episodes = play_episodes(config, policy, layouts, deterministic)
-        found["layouts"] += layouts
-        found["returns"] += [episode.total for episode in episodes]
-        found["successes"] += [episode.success for episode in episodes]
-        run.update_record(evaluation=found)
-    if "layout" in policy.description and found["own_layout"] is None:
-        (episode,) = play_episodes(config, policy, [policy.description["layout"]], deterministic)
-        run.update_record(evaluation=found | {"own_layout": episode.total})
+    layouts = range(evaluation_seed(config), evaluation_seed(config) + protocol.episodes)
+    episodes = play_episodes(config, policy, layouts, deterministic)
+    own = None
+    if "layout" in policy.description:
+        own = play_episodes(config, policy, [policy.description["layout"]], deterministic)[0].total
+    found = {
+        "observes": observes,
+        "layouts": [*layouts],
+        "returns": [episode.total for episode in episodes],
+        "successes": [episode.success for episode in episodes],
+        "own_layout": own,
+    }
+    run.update_record(evaluation=conditions(run, protocol) | found)
 
 
 def read_evaluation(run: Run, protocol: Protocol) -> dict[str, Any] | None:
-    """The evaluation of a run under a protocol; None if it is not complete."""
+    """The evaluation of a run under a protocol; None if there is none."""
     found: dict[str, Any] = run.record.get("evaluation", {})
-    noise = not protocol.deterministic(run.task)
-    conditions = {"policy": identity(run), "particles": protocol.particles, "noise": noise}
-    if any(found.get(name) != value for name, value in conditions.items()):
-        return None
-    if len(found["returns"]) < protocol.episodes:
-        return None
-    return found | {name: found[name][: protocol.episodes] for name in ("layouts", "returns", "successes")}
+    return found if conditions(run, protocol).items() <= found.items() else None

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines import train
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.registry import ALGORITHMS
-from cfp.config import EVALUATION_SEED, to_words
+from cfp.config import EVALUATION_SEED, RunConfig, to_words
 from cfp.errors import ConfigError
+from cfp.experiment.run import check_options
 from cfp.files import read_json, write_json
+from cfp.train import from_python
 
 #: Options of a command line by name, with underscores.
 Options = dict[str, Any]
@@ -25,7 +24,7 @@ LARGEST_SEED = EVALUATION_SEED - 1001
 #: What the command line of the comparison gives to every run.
 GIVEN = ("device", "preset", "seed", "task")
 #: Options that define the task, which must be the same for all algorithms on it.
-TASK_OPTIONS = ("dt", "dtype", "resample", "substeps", "target", "variant")
+SAME_FOR_ALL = ("dt", "dtype", "resample", "substeps", "target", "variant")
 #: Options that change neither what a run learns nor which policy it keeps.
 WITHOUT_INFLUENCE = ("backend", "checkpoint_every", "device", "log_every", "video")
 #: What a comparison keeps in the folder of a run: its options, its training time and its evaluation.
@@ -62,12 +61,9 @@ class Run:
         """What `RECORD` holds; nothing before the run has begun. A `ConfigError` if it cannot be read."""
         path = self.folder / RECORD
         try:
-            record = json.loads(path.read_text()) if path.exists() else {}
-            if not isinstance(record, dict):
-                raise ValueError(f"it must hold an object, got {record!r}")
+            return read_json(path) if path.exists() else {}
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path}: cannot be read ({error})") from error
-        return record
 
     def update_record(self, **values: Any) -> None:
         """Put values into the record."""
@@ -100,23 +96,16 @@ class Run:
                 )
 
 
-def resolved(options: Options) -> dict[str, Any]:
-    """The whole configuration of a training, as its ``--dry-run`` prints it; `ConfigError` with what it objects to."""
-    output, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
-        try:
-            code = train.main([*to_words(options), "--dry-run"])
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-    if code:
-        raise ConfigError(" ".join(errors.getvalue().split()).removeprefix("error: "))
-    config: dict[str, Any] = json.loads(output.getvalue())
+def resolved(options: Options) -> RunConfig:
+    """The whole configuration of a training; a `ConfigError` if it would not start."""
+    config = from_python(options, None, False).run
+    check_options(config)
     return config
 
 
-def reference_config(options: Options) -> dict[str, Any]:
+def reference_config(options: Options) -> RunConfig:
     """The configuration in whose environment a reference policy acts, that of a single stage of learning."""
-    kept = {name: value for name, value in options.items() if name in ("task", *TASK_OPTIONS)}
+    kept = {name: value for name, value in options.items() if name in ("task", *SAME_FOR_ALL)}
     preset = "paper" if options["preset"] == "paper" else "quick"
     return resolved({"algo": "coarse", "preset": preset, **kept})
 
@@ -136,9 +125,9 @@ def read_plan(path: Path | None) -> dict[str, Any]:
     for task, options in _check_section("tasks", plan["tasks"]).items():
         _check_section(f"tasks.{task}", options, GIVEN)
     for label, options in _check_section("algos", plan["algos"]).items():
-        _check_section(f"algos.{label}", options, (*GIVEN, *TASK_OPTIONS))
+        _check_section(f"algos.{label}", options, (*GIVEN, *SAME_FOR_ALL))
         for task, own in _check_section(f"algos.{label}.tasks", options.get("tasks", {})).items():
-            _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *TASK_OPTIONS))
+            _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *SAME_FOR_ALL))
     return plan
 
 
@@ -196,7 +185,7 @@ def make_runs(
             try:
                 if options["algo"] in REFERENCE_POLICIES:
                     reference_config(options)
-                elif "steps" in resolved(options) and steps is not None:
+                elif hasattr(resolved(options), "steps") and steps is not None:
                     options.setdefault("steps", steps)
                     resolved(options)
             except ConfigError as error:

@@ -23,6 +23,7 @@ from cfp.files import write_text
 Outcome = Literal["finished", "failed", "stopped", "in use"]
 WORKER = (sys.executable, "-m", "baselines.compare.worker")
 POLL = 0.2  # seconds between two looks at a process and at what it is asked for
+RETRIES = 2  # further attempts after the process or node of a run was lost
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,6 @@ class Resources:
 
     threads: int = 1
     gpus: float = 0.0  # also a fraction of one; with Ray only
-    retries: int = 2  # further attempts after its process or node was lost
-    wait: float = 30.0  # seconds to wait for another process that holds the folder
 
 
 def carry_out(run: Run, protocol: Protocol, resources: Resources, urgency: Callable[[], int] = lambda: 0) -> Outcome:
@@ -50,9 +49,9 @@ def carry_out(run: Run, protocol: Protocol, resources: Resources, urgency: Calla
     error = run.folder / "error.txt"
     error.unlink(missing_ok=True)
     given = asdict(run) | {"folder": str(run.folder)}
-    words = [*WORKER, json.dumps({"run": given, "protocol": asdict(protocol), "wait": resources.wait})]
+    words = [*WORKER, json.dumps({"run": given, "protocol": asdict(protocol)})]
     code = 0
-    for _ in range(1 + resources.retries):
+    for _ in range(1 + RETRIES):
         code, last_line = _call(words, run, resources.threads, urgency)
         if code >= 0 or urgency():
             break
@@ -131,7 +130,7 @@ class RayExecutor:
         self._task = ray.remote(carry_out).options(
             num_cpus=resources.threads,
             num_gpus=resources.gpus,
-            max_retries=resources.retries,
+            max_retries=RETRIES,
             scheduling_strategy="SPREAD",
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,12 +9,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import scipy.stats
 from matplotlib.figure import Figure
 
 from baselines.compare.evaluation import Protocol, read_evaluation
 from baselines.compare.plan import Run
 from cfp.evaluation.page import STYLE, write_figure
+from cfp.evaluation.returns import t_interval
 from cfp.files import write_text
 from cfp.learner import Sees
 from cfp.tables import Table, columns, csv_text, read_table
@@ -25,14 +24,6 @@ Curve = tuple[np.ndarray, np.ndarray]
 SEES = get_args(Sees)
 LINES = dict(zip(SEES, ("-", "--", ":", "-."), strict=True))
 RAW = ("task", "observes", "algorithm", "seed", "layout", "return", "success")
-
-
-def t_interval(values: Sequence[float]) -> float | None:
-    """Half the width of the 95 % confidence interval of a mean (Student's t); None for fewer than two values."""
-    count = len(values)
-    if count < 2:
-        return None
-    return float(scipy.stats.t.ppf(0.975, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
 
 
 def paired_differences(ours: dict[int, float], theirs: dict[int, float]) -> list[float]:

@@ -20,13 +20,15 @@ from baselines.compare.plan import Run
 
 #: Exit code if another process holds the run; a training never ends with it.
 IN_USE = 3
+#: Seconds to wait for another process that holds the run; file servers take a while to give up a lost machine.
+WAIT = 120.0
 
 
-def carry_out(run: Run, protocol: Protocol, wait: float) -> int:
+def train_and_evaluate(run: Run, protocol: Protocol) -> int:
     """Do what is left of a run; returns an exit code, that of the training if it is not 0."""
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(run.folder / ".comparison.lock", timeout=wait):
+        with FileLock(run.folder / ".comparison.lock", timeout=WAIT):
             run.check_folder()
             record = run.record
             run.update_record(options=run.options)
@@ -54,7 +56,7 @@ def main() -> int:
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     values = json.loads(sys.argv[1])
     run = Run(**values["run"] | {"folder": Path(values["run"]["folder"])})
-    return carry_out(run, Protocol(**values["protocol"]), values["wait"])
+    return train_and_evaluate(run, Protocol(**values["protocol"]))
 
 
 if __name__ == "__main__":

@@ -49,6 +49,8 @@ from dittogym import TorchEnv, make_spec
 from dittogym.spec import DT
 from torchmpm import tree
 
+#: Control steps after which it is drawn anew whether teacher or student acts on a robot.
+SWITCH_EVERY = 8
 #: Teachers that are trained first if only their algorithm is named.
 TRAINED = ("shac", "gradient")
 
@@ -93,13 +95,9 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Largest norm of the gradient."""
     beta_decay: float = 0.7
     """Factor by which beta, the probability that the teacher acts, falls from round to round; it starts at 1."""
-    switch_every: int = 8
-    """Control steps after which it is drawn anew whether teacher or student acts on a robot."""
     dropout: float = 0.0
     """Probability with which entries of the student's observations and actions are set to 0, in half of them, so that
     it learns to do without."""
-    capacity: int = 100_000
-    """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
     max_episode_steps: int = 400
     """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
     num_layouts: int = 64
@@ -127,7 +125,6 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
         super().check()
         self.check_planner(self.planner_resolution)
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
-        check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
         check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
@@ -142,10 +139,9 @@ class Labels(NamedTuple):
 
 
 class Dataset:
-    """The labels of all rounds; the oldest rounds are dropped when there are too many."""
+    """The labels of all rounds: 12 KiB for an image, and 8 R R bytes for an action on the smaller of both grids."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
+    def __init__(self) -> None:
         self.rounds: list[Labels] = []
         self._compressed: list[Tensor | None] = []
 
@@ -154,13 +150,10 @@ class Dataset:
         return sum(len(labels.observations) for labels in self.rounds)
 
     def add(self, labels: Labels) -> None:
-        """Add a round, if it has labels; the newest is kept whole even if it alone exceeds the capacity."""
-        if not len(labels.observations):
-            return
-        self.rounds.append(labels)
-        self._compressed.append(None)
-        while len(self.rounds) > 1 and len(self) > self.capacity:
-            del self.rounds[0], self._compressed[0]
+        """Add a round, if it has labels."""
+        if len(labels.observations):
+            self.rounds.append(labels)
+            self._compressed.append(None)
 
     def sample(self, count: int) -> Labels:
         """Draw labels uniformly with replacement, from torch's generator."""
@@ -302,8 +295,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         seed = config.seed + (self.stage - 1) * config.num_layouts
         episodes = Episodes(self.simulation, seed, config.max_episode_steps, config.num_layouts)
         guide, grid = self._make_teacher(), self.spec.resolutions[-1]
-        self.collector = Collector(guide, episodes, config.switch_every, config.dropout, grid)
-        self.dataset, self.rounds = Dataset(config.capacity), 0
+        self.collector = Collector(guide, episodes, SWITCH_EVERY, config.dropout, grid)
+        self.dataset, self.rounds = Dataset(), 0
         self._last_obs = self.simulation.observation().cpu().numpy()
 
     def _make_teacher(self) -> Teacher:
@@ -504,5 +497,5 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             return []
         return [
             f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
-            "evaluate it from other starts (python -m baselines.evaluate --policy), or use mpc, which plans anew"
+            "evaluate it from other starts (torchmpm evaluate --policy), or use mpc, which plans anew"
         ]

@@ -62,16 +62,6 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
         raise ConfigError(" ".join(str(error).split())) from error
 
 
-def batch_size(config: RunConfig, episodes: int) -> int:
-    """How many of some episodes share an environment: on a CPU none, so that each runs on a core of its own."""
-    return 1 if on_cpu(config) else episodes
-
-
-def on_cpu(config: RunConfig) -> bool:
-    """Whether a run simulates on a CPU."""
-    return torch.device(choose_device(config.device)).type == "cpu"
-
-
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Seed torch's generators of all devices, and restore them afterwards."""

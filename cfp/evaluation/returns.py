@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.disturbances import Disturbed
-from cfp.envs.make import batch_size, make_env
+from cfp.envs.make import choose_device, make_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.policy import DisturbablePolicy, Memory, Observation, Policy, Start, StatePolicy
 from dittogym.render.recording import seed_noise
@@ -177,7 +177,7 @@ def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, d
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
-        batch=batch_size(config, episodes),
+        batch=1 if torch.device(choose_device(config.device)).type == "cpu" else episodes,
     )
 
 
@@ -232,6 +232,14 @@ def play(
 # Their returns.
 
 
+def t_interval(values: Sequence[float]) -> float | None:
+    """Half the width of the 95 % confidence interval of a mean (Student's t); None for fewer than two values."""
+    count = len(values)
+    if count < 2:
+        return None
+    return float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(count))
+
+
 @dataclass(frozen=True)
 class Result:
     """Undiscounted returns of some episodes of a policy."""
@@ -253,11 +261,8 @@ class Result:
 
     @property
     def interval(self) -> float | None:
-        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
-        count = len(self.returns)
-        if count < 2:
-            return None
-        return float(stdtrit(count - 1, 0.975) * np.std(self.returns, ddof=1) / math.sqrt(count))
+        """Half the width of the 95 % confidence interval of the mean; None for one episode."""
+        return t_interval(self.returns)
 
 
 def evaluate(

@@ -16,7 +16,7 @@ from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_see
 from cfp.policy import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
-from dittogym.render.recording import OPTIONS, Act, Recording, check_options, record
+from dittogym.render.recording import OPTIONS, Act, FilmOptions, Recording, record
 
 Recorded = TypeVar("Recorded")
 
@@ -64,7 +64,7 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
             suffixes = " or ".join(suffix for suffix, names in OPTIONS.items() if name in names)
             raise ConfigError(f"{name} requires a file that ends in {suffixes}, got none")
     try:
-        check_options(**options)
+        FilmOptions(**options)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 
@@ -78,7 +78,7 @@ def save_media(
         recording: The episode.
         paths: Files by what they hold, ``video`` and ``replay``; None: not wanted.
         output: Where to print; None: the standard output.
-        options: See `dittogym.render.recording.Recording.save`.
+        options: See `dittogym.render.recording.FilmOptions`.
     """
     for name, path in paths.items():
         try:

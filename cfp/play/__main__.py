@@ -6,7 +6,7 @@ import contextlib
 import secrets
 import sys
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -15,7 +15,8 @@ import tyro
 
 from cfp.errors import ConfigError
 from cfp.experiment.cli import read_command, run_command
-from cfp.policy import load, read_policy, shipped
+from cfp.policy import read_policy, shipped
+from cfp.registry import load
 from dittogym.tasks import check_task
 
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
@@ -48,8 +49,8 @@ class Command:
     """Open the page in a browser."""
 
 
-def options(command: Command, load: Callable[[str], Any] = load) -> dict[str, Any]:
-    """Arguments of :class:`cfp.play.session.Session`; ``load`` reads a policy."""
+def options(command: Command) -> dict[str, Any]:
+    """Arguments of :class:`cfp.play.session.Session`."""
     known = {name: read_policy(name)[1] for name in shipped()}
     chosen: dict[str, Any] = {}
     if command.policy is not None:
@@ -64,7 +65,7 @@ def options(command: Command, load: Callable[[str], Any] = load) -> dict[str, An
     return chosen | {"task": task, "policies": {name: partial(load, name) for name in names}}
 
 
-def play(command: Command, load: Callable[[str], Any] = load) -> None:
+def play(command: Command) -> None:
     """Serve the page until Ctrl-C."""
     try:
         from cfp.play.server import Server
@@ -72,7 +73,7 @@ def play(command: Command, load: Callable[[str], Any] = load) -> None:
     except ModuleNotFoundError as error:
         raise ConfigError(f"the page needs a web server: pip install torchmpm[play] ({error})") from error
     try:
-        new_session = partial(Session, **options(command, load))
+        new_session = partial(Session, **options(command))
         new_session()  # what is wrong with the options shows before a page is opened
         server = Server(new_session, secrets.token_urlsafe(16), command.port)
     except (TypeError, ValueError) as error:
@@ -84,14 +85,9 @@ def play(command: Command, load: Callable[[str], Any] = load) -> None:
         server.run()
 
 
-def main(arguments: Sequence[str] | None = None, load: Callable[[str], Any] = load) -> int:
-    """Command line entry; returns the exit code.
-
-    Args:
-        arguments: Of the command line.
-        load: Reads a policy by its name or path; :func:`baselines.load` knows those of other algorithms, too.
-    """
-    return run_command(lambda: play(read_command(Command, "cfp.play", EXAMPLES, arguments), load))
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    return run_command(lambda: play(read_command(Command, "cfp.play", EXAMPLES, arguments)))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 #: Pixels of the largest picture that is read from a file, 2048 x 2048: a body drawn in one may take 240 bytes for each.
 LARGEST = 2**22
@@ -66,31 +66,25 @@ def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
     path = os.fspath(picture)
     if not os.path.isfile(path):
         raise ValueError(f"{name} must be {others}an array or the path of an image; no such file: {path!r}")
-    if path.lower().endswith((".svg", ".svgz")):
-        raise ValueError(f"{name} must be made of pixels, got the vector drawing {path!r}; export it as PNG")
     try:
-        (width, height), transparent = _claims(path)
-        small = width * height <= LARGEST
-        # Without transparency OpenCV turns photographs as their EXIF orientation says.
-        flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
-        image = cv2.imread(path, flags) if small else None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, cv2.error) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
+            with Image.open(path) as image:
+                size = image.size
+                decoded = _decoded(image) if size[0] * size[1] <= LARGEST else None
+    except Exception as error:  # decoders of damaged files raise whatever comes to hand
         raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
-    if not small:
-        raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
-    if image is None:
-        raise ValueError(f"{name} {path!r} cannot be read as an image")
-    return _as_bytes(image, name)
+    if decoded is None:
+        raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {size[0]} x {size[1]}")
+    return _as_bytes(decoded, name)
 
 
-def _claims(path: str) -> tuple[tuple[int, int], bool]:
-    """Size and transparency from the head of a file: a few bytes may claim to be what fills the memory."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
-        with Image.open(path) as image:
-            size, transparent = image.size, image.has_transparency_data
-            image.verify()  # OpenCV takes memory for whatever length a chunk of a PNG claims
-            return size, transparent
+def _decoded(image: Image.Image) -> np.ndarray:
+    """Grey values of 16 bits as they are, all else as RGB or RGBA, turned as its EXIF orientation says."""
+    turned = ImageOps.exif_transpose(image)
+    if turned.mode.startswith("I"):
+        return np.asarray(turned).astype(np.uint16)
+    return np.asarray(turned.convert("RGBA" if turned.has_transparency_data else "RGB"))
 
 
 def _as_bytes(image: np.ndarray, name: str) -> np.ndarray:

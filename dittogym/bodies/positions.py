@@ -92,7 +92,7 @@ class InitialPositions:
         random: Random positions instead of evenly spread ones, see :func:`body_positions`.
         resample: Draw anew at every reset.
         generators: By element of the batch.
-        positions: (B, N, 2) in the world, m; ``None`` before the first draw.
+        positions: (B, N, 2) in the world, m; empty before the first draw.
     """
 
     spec: TaskSpec
@@ -101,13 +101,13 @@ class InitialPositions:
     random: bool
     resample: bool
     generators: Mapping[int, np.random.RandomState] = field(default_factory=dict)
-    positions: Tensor | None = None
+    positions: Tensor = field(default_factory=lambda: torch.empty(0))
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
         seeds, generators = self._seeds(seed), dict(self.generators)
         # Every element has positions from the first draw on.
-        redrawn = np.ones_like(mask) if self.positions is None else mask.copy()
+        redrawn = mask.copy() if len(self.positions) else np.ones_like(mask)
         for i in np.flatnonzero(redrawn).tolist():
             if seeds[i] is not None or i not in generators:
                 generators[i] = np.random.RandomState(seeds[i])
@@ -126,18 +126,10 @@ class InitialPositions:
             positions = torch.from_numpy(stacked).to(like)
         else:
             return self
-        if self.positions is not None:
+        if len(self.positions):
             positions = tree.where(torch.as_tensor(redrawn, device=like.device), positions, self.positions)
         self._check_inside(positions)
         return replace(self, generators=generators, positions=positions)
-
-    def even(self, num_envs: int, like: Tensor) -> Tensor:
-        """The same evenly spread positions (num_envs, N, 2) for all simulations; ``like`` gives dtype and device."""
-        drawn = [
-            body_positions(body, count, np.random.RandomState(0), random=False)
-            for body, count in zip(self.spec.bodies, self.counts, strict=True)
-        ]
-        return torch.from_numpy(np.concatenate(drawn)).to(like).expand(num_envs, -1, -1).contiguous()
 
     def _seeds(self, seed: Seed) -> Sequence[int | None]:
         if seed is None:

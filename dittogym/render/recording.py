@@ -24,7 +24,7 @@ from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
 Act: TypeAlias = Callable[[np.ndarray], Any]
-#: Options of :meth:`Recording.save` that have an effect, by suffix.
+#: Of :class:`FilmOptions` those that have an effect, by suffix.
 OPTIONS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(UNITS, ("size", "rate", "speed", "zoom", "muscles")),
     ".png": ("size", "zoom", "muscles", "pictures"),
@@ -33,6 +33,38 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 #: Playback speeds, as a fraction of real time, and the shortest film for which one of them is chosen, s.
 SPEEDS = tuple(mantissa / 10**exponent for exponent in range(6) for mantissa in (1.0, 0.5, 0.2))
 SHORTEST = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions:
+    """Options of films, filmstrips and replays.
+
+    Attributes:
+        size: Pixels per side of a picture.
+        rate: Pictures per second of a film.
+        speed: Of playback, 1 is real time; ``None``: :attr:`Recording.default_speed`.
+        zoom: A picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
+        muscles: Colour the robot by its muscles: contraction red, expansion blue.
+        pictures: Number of pictures of a filmstrip, from the start to the end at equal intervals.
+
+    Raises:
+        ValueError: One is out of range.
+    """
+
+    size: int = 512
+    rate: float = 30.0
+    speed: float | None = None
+    zoom: float | None = None
+    muscles: bool = True
+    pictures: int = 6
+
+    def __post_init__(self) -> None:
+        check_view(self.size, self.zoom)
+        checks.number("rate", self.rate, above=0.0)
+        if self.speed is not None:
+            checks.number("speed", self.speed, above=0.0)
+        checks.flag("muscles", self.muscles)
+        checks.whole("pictures", self.pictures, 1)
 
 
 @dataclass(eq=False, repr=False)
@@ -93,92 +125,59 @@ class Recording:
             before = after._replace(**moved)
         return frame(self.scene, before, size, zoom, muscles, caption)
 
-    def frames(
-        self,
-        *,
-        size: int = 512,
-        rate: float = 30.0,
-        speed: float | None = None,
-        zoom: float | None = None,
-        muscles: bool = True,
-    ) -> Iterator[np.ndarray]:
-        """The pictures of a film with task, time, return and playback speed; for the arguments see :meth:`save`."""
-        speed = self.default_speed if speed is None else speed
-        checks.number("speed", speed, above=0.0)
-        checks.number("rate", rate, above=0.0)
-        returns = np.cumsum([0.0, *self.rewards])
-        for number in range(round(self.duration / speed * rate) + 1):
-            time = min(number * speed / rate, self.duration)
-            total = returns[min(round(time / self.scene.dt), len(self.rewards))]
-            caption = f"{self.scene.task}   {time:.{self._digits}f} s", f"return {total:.1f}   {pace(speed)}"
-            yield self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption)
-
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        size: int = 512,
-        rate: float = 30.0,
-        speed: float | None = None,
-        zoom: float | None = None,
-        muscles: bool = True,
-        pictures: int = 6,
-    ) -> Path:
+    def save(self, path: str | os.PathLike[str], **options: Any) -> Path:
         """Write a film, a filmstrip or a replay, and return its path.
-
-        A filmstrip takes no ``rate`` and ``speed``, a film no ``pictures``, a replay only ``speed``. Other options have
-        no effect, so that several files can share them; ``film(policy, path, ...)`` of an environment refuses them.
 
         Args:
             path: ``.mp4``, ``.gif`` or ``.webp``: a film; ``.png``: some pictures beside each other; ``.html``: a page
                 that plays the episode in any browser, also without a network.
-            size: Pixels per side of a picture.
-            rate: Pictures per second.
-            speed: 1: real time. ``None``: :attr:`default_speed`.
-            zoom: The picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
-            muscles: Colour the robot by its muscles: contraction red, expansion blue.
-            pictures: Number of pictures of a filmstrip, from the start to the end at equal intervals.
+            options: Of :class:`FilmOptions`. Those that this kind of file does not take have no effect, so that several
+                files can share them; ``film(policy, path, ...)`` of an environment refuses them.
 
         Raises:
             ValueError: The suffix is another, or a number is out of range.
+            TypeError: There is no such option.
             dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``.
         """
-        shown: dict[str, Any] = {"size": size, "zoom": zoom, "muscles": muscles}
-        path = check_path(path)
-        check_options(rate=rate, speed=speed, pictures=pictures, **shown)
+        path, chosen = check_path(path), FilmOptions(**options)
         if path.suffix == ".html":
             with replacing(path) as aside:
-                aside.write_text(self.page(speed), encoding="utf-8")
+                aside.write_text(self.page(chosen.speed), encoding="utf-8")
         elif path.suffix == ".png":
             with replacing(path) as aside:
-                Image.fromarray(self._strip(pictures, **shown)).save(aside)
+                Image.fromarray(self._strip(chosen)).save(aside)
         else:
-            rate = possible_rate(path.suffix, rate)
-            write_film(path, self.frames(rate=rate, speed=speed, **shown), rate)
+            rate = possible_rate(path.suffix, chosen.rate)
+            write_film(path, self._frames(chosen, rate), rate)
         return path
 
     def page(self, speed: float | None = None) -> str:
-        """The replay as an HTML page, which begins to play at a ``speed``; 1: real time.
+        """The replay as an HTML page, which begins to play at a ``speed``, see :class:`FilmOptions`."""
+        return replay_page(self.scene, self.shots, self.rewards, self.success, speed or self.default_speed)
 
-        Raises:
-            ValueError: The speed is not a positive number.
-        """
-        speed = self.default_speed if speed is None else speed
-        checks.number("speed", speed, above=0.0)
-        return replay_page(self.scene, self.shots, self.rewards, self.success, speed)
+    def _frames(self, options: FilmOptions, rate: float) -> Iterator[np.ndarray]:
+        """The pictures of a film with task, time, return and playback speed."""
+        speed = options.speed or self.default_speed
+        returns = np.cumsum([0.0, *self.rewards])
+        for number in range(round(self.duration / speed * rate) + 1):
+            time = min(number * speed / rate, self.duration)
+            total = returns[min(round(time / self.scene.dt), len(self.rewards))]
+            caption = f"{self.scene.task}   {self._clock(time)}", f"return {total:.1f}   {pace(speed)}"
+            yield self._picture(time, options, caption)
 
-    @property
-    def _digits(self) -> int:
-        """Digits behind the point of times, so that steps can be told apart."""
-        return max(2, int(np.ceil(-np.log10(self.scene.dt) - 1e-9)))
-
-    def _strip(self, pictures: int, *, size: int, **shown: Any) -> np.ndarray:
+    def _strip(self, options: FilmOptions) -> np.ndarray:
+        gap = np.full((options.size, max(1, options.size // 64), 3), 255, np.uint8)
         strip = []
-        for time in np.linspace(0, self.duration, pictures):
-            caption = f"{time:.{self._digits}f} s", ""
-            strip += [self.picture(time, size=size, caption=caption, **shown)]
-            strip += [np.full((size, max(1, size // 64), 3), 255, np.uint8)]
+        for time in np.linspace(0, self.duration, options.pictures):
+            strip += [self._picture(time, options, (self._clock(time), "")), gap]
         return np.concatenate(strip[:-1], axis=1)
+
+    def _picture(self, time: float, options: FilmOptions, caption: tuple[str, str]) -> np.ndarray:
+        return self.picture(time, size=options.size, zoom=options.zoom, muscles=options.muscles, caption=caption)
+
+    def _clock(self, time: float) -> str:
+        """A time in s with so many digits that steps can be told apart."""
+        return f"{time:.{max(2, int(np.ceil(-np.log10(self.scene.dt) - 1e-9)))}f} s"
 
     def _repr_html_(self) -> str:
         page = escape(self.page())
@@ -192,26 +191,9 @@ def check_path(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def check_options(
-    size: int = 512,
-    rate: float = 30.0,
-    speed: float | None = None,
-    zoom: float | None = None,
-    muscles: bool = True,
-    pictures: int = 6,
-) -> None:
-    """Check the options of :meth:`Recording.save`."""
-    check_view(size, zoom)
-    checks.number("rate", rate, above=0.0)
-    if speed is not None:
-        checks.number("speed", speed, above=0.0)
-    checks.flag("muscles", muscles)
-    checks.whole("pictures", pictures, 1)
-
-
 def check_film(path: Any, options: Mapping[str, Any]) -> None:
     """Check the arguments of :meth:`Recording.save` for a single file, of which none may be without effect."""
-    check_options(**options)
+    FilmOptions(**options)
     if path is None:
         if options:
             raise TypeError(f"path must be given with {', '.join(options)}, got None")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
@@ -43,17 +41,6 @@ def headline(task: str) -> tuple[str, str]:
         return name, ""
     title, _, goal = (inspect.getdoc(inspect.getmodule(TASKS[name])) or "").partition(": ")
     return title, goal[:1].upper() + goal[1:]
-
-
-def fingerprint(task: str) -> str | None:
-    """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file."""
-    try:
-        file = Path(inspect.getsourcefile(TASKS[task_name(task)]) or "")
-    except TypeError:  # no plain function
-        return None
-    if not file.is_file() or file.parent == Path(__file__).parent:
-        return None
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def check_task(task: object) -> None:
@@ -99,24 +86,18 @@ def make_spec(
         TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
     """
     if isinstance(task, TaskSpec):
-        if options:
-            name = next(iter(options))
-            raise TypeError(
-                f"task {task.name!r} got an unexpected keyword argument {name!r}; a TaskSpec takes body and "
-                "obstacles alone, other options are for the function that makes it"
-            )
-        spec = task
+        name, make = task.name, lambda: task
     else:
         check_task(task)
-        make = TASKS[task_name(task)]
-        parameters = inspect.signature(make).parameters.values()
-        known = [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
-        takes_all = any(each.kind is each.VAR_KEYWORD for each in parameters)
-        if unknown := [name for name in options if name not in known and not takes_all]:
-            # The words are Python's own, which programs that try out options look for.
-            names = f"its options are {', '.join(('body', 'obstacles', *known))}, beside those of TorchEnv"
-            raise TypeError(f"task {task_name(task)!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
-        spec = make(**options)
+        name = task_name(task)
+        make = TASKS[name]
+    signature = inspect.signature(make)
+    try:
+        signature.bind(**options)
+    except TypeError as error:  # in Python's words, which programs that try out options look for
+        known = ", ".join(("body", "obstacles", *signature.parameters))
+        raise TypeError(f"task {name!r} {error}; its options are {known}, beside those of TorchEnv") from error
+    spec = make(**options)
     if obstacles is not None:
         obstacles = [from_values(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles
         checks.instances("obstacles", obstacles, Obstacle)

@@ -1,7 +1,7 @@
-"""Bad arguments of dittogym."""
+"""Bad arguments of dittogym: what the error must name, and a call."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gymnasium
 import numpy as np
@@ -9,17 +9,22 @@ import torch
 from bad_cases import table
 
 import dittogym
-from dittogym import TorchEnv, make_spec
+from dittogym import Reward, TorchEnv, core, make_spec, trajectories
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
-from dittogym.geometry import Box, Window, solid
-from dittogym.rewards import EXACT
+from dittogym.geometry import Box, Obstacle, Window, floor, solid
+from dittogym.render.recording import as_function
+from dittogym.rewards import EXACT, SMOOTH, distance
 from dittogym.spec import BodySpec
+from dittogym.wrappers import action_resolution, observation_resolution
+from torchmpm import Elastic, VelocityRule
 
 ID = "dittogym/run-coarse-v0"
+SMALL = {"particles": 60, "substeps": 1}
+NAN, ONE = math.nan, torch.zeros(1)
 
 
 def env(**changes):
-    return TorchEnv(**{"task": "run", "particles": 60, "substeps": 1, "backend": "eager", **changes})
+    return TorchEnv(**{"task": "run", **SMALL, "backend": "eager", **changes})
 
 
 def begun(**changes):
@@ -33,12 +38,11 @@ def spec(**changes):
 
 
 def single(**options):
-    return gymnasium.make(ID, **{"particles": 60, "substeps": 1, **options}).unwrapped
+    return gymnasium.make(ID, **SMALL, **options).unwrapped
 
 
 def batch(**options):
-    options = {"particles": 60, "substeps": 1, **options}
-    return gymnasium.make_vec(ID, 2, vectorization_mode="vector_entry_point", **options)
+    return gymnasium.make_vec(ID, 2, vectorization_mode="vector_entry_point", **SMALL, **options)
 
 
 def step(made, action):
@@ -46,87 +50,271 @@ def step(made, action):
     return made.step(action)
 
 
-def reset(**options):
-    return env().reset(options=options)
+def action(**options):
+    return begun().step(torch.zeros((2, 2, 8, 8), **options))
 
 
-CASES = table(
-    [
-        ("task of a list", lambda: env(task=["run"]), "task"),
-        ("task of a function", lambda: env(task=make_spec), ("task", "dittogym.register")),
-        ("robots and a half", lambda: env(num_envs=1.5), "num_envs"),
-        ("resolution of a float", lambda: env(resolution=8.0), ("resolution", "1 to 64", "got 8.0")),
-        ("half particles", lambda: env(particles=(1.5,)), "particles[0]"),
-        ("substeps not a number", lambda: env(substeps=math.nan), "substeps"),
-        ("dtype of torch", lambda: env(dtype=torch.float16), "dtype"),
-        ("device abacus", lambda: env(device="abacus"), ("device", "got 'abacus'")),
-        ("layout of a page", lambda: env(action_layout="page"), ("action_layout", "got 'page'")),
-        ("resample no", lambda: env(resample="no"), "resample"),
-        ("seed and a half", lambda: env().reset(seed=1.5), "seed"),
-        ("seed too large", lambda: env(num_envs=2).reset(seed=2**32 - 1), "seed"),
-        ("options of a list", lambda: env().reset(options=[1]), ("options must be a mapping", "physics", "got [1]")),
-        ("positions of a text", lambda: reset(positions="x"), ("positions", "'x'")),
-        ("positions of NaN", lambda: reset(positions=np.full((60, 2), math.nan)), "positions"),
-        ("mu of a truth", lambda: reset(physics={"mu": True}), ("physics['mu']", "True")),
-        ("gravity that crosses cells", lambda: reset(physics={"gravity": (0.0, -1e12)}), "physics['gravity']"),
-        ("mass of a planet", lambda: reset(physics={"mass": 1e30}), "physics['mass']"),
-        ("load, mask of a text", lambda: (e := begun()).load(e.save(), "x"), ("mask must be bool of shape", "'x'")),
-        ("action of an array", lambda: begun().step(np.zeros((2, 2, 8, 8))), ("action", "got ndarray")),
-        ("action of bits", lambda: begun().step(torch.zeros(2, 2, 8, 8, device="meta")), "action"),
-        ("action beyond float32", lambda: begun().step(torch.full((2, 2, 8, 8), 1e300, dtype=torch.float64)), "action"),
-        ("masked action", lambda: step(single(), np.ma.masked_all((2, 8, 8))), "128 masked entries"),
-        ("actions of words", lambda: step(single(), "left"), ("action", "<U4")),
-        ("action of rows", lambda: step(single(), [[1.0], [1.0, 2.0]]), ("action", "list: ")),
-        ("sparse action", lambda: step(single(), torch.zeros(2, 8, 8).to_sparse()), ("action", "Sparse")),
-        ("actions for three", lambda: step(batch(), np.zeros((3, 2, 8, 8))), ("(2, 2, 8, 8)", "(3, 2, 8, 8)")),
-        ("soft by name", lambda: begun().step(torch.zeros(2, 2, 8, 8), soft="no"), "soft"),
-        ("muscles by name", lambda: single(render_muscles="x"), "render_muscles"),
-        ("picture without pixels", lambda: single(render_size=0), "render_size"),
-        ("pictures without pixels", lambda: batch(render_size=0), "render_size"),
-        ("muscles of a batch", lambda: batch(render_muscles=1), "render_muscles"),
-        ("picture from afar", lambda: begun().render(zoom=1e-9), "zoom"),
-        ("picture too large", lambda: begun().render(size=10**6), "size"),
-        ("policy of nothing", lambda: env().film(lambda seen: None), "policy"),
-        ("autoreset sometimes", lambda: batch(autoreset_mode="x"), ("autoreset_mode", "got 'x'")),
-        ("limit of no steps", lambda: batch(max_episode_steps=0), "max_episode_steps"),
-        (
-            "state of another task",
-            lambda: setattr(begun(task="catch", particles=(60, 60)), "env_state", begun(particles=120).env_state),
-            ("env_state", "object_com"),
-        ),
-        ("target of numbers", lambda: spec(target=np.zeros((64, 64))), "target"),
-        ("target of a number", lambda: make_spec("shapematch", target=3), "target"),
-        ("task, window of both kinds", lambda: Window(left=0.1, follow=0.4), "left"),
-        ("task, patch too wide", lambda: spec(patch=200), "patch"),
-        ("task, two objects", lambda: spec(objects=(spec().robot,) * 2), "objects"),
-        ("goal outside of the window", lambda: env(task=replace(make_spec("grow"), goal=(9.0, 0.0))), "goal"),
-        ("variant of a name", lambda: make_spec("slot", variant="soft"), "variant"),
-        ("box of no order", lambda: Box(0.5, 0.1), ("left and right", "got 0.5 and 0.1")),
-        ("box at a name", lambda: solid("box", ("a", "b"), (0, 9)), "i must be"),
-        ("box at a truth", lambda: solid("box", (True, 9), (0, 9)), "i must be"),
-        ("box from 9 to 0", lambda: solid("box", (9, 0), (0, 9)), ("low <= high", "got (9, 0)")),
-        ("box seen by name", lambda: solid("box", (0, 9), (0, 9), visible="no"), "visible"),
-        ("step of no width", lambda: EXACT.heaviside(torch.zeros(1), 0.0), "width"),
-        ("clamp of no order", lambda: EXACT.clamp(torch.zeros(1), 1.0, 0.5), "low"),
-        (
-            "nearest of all twice",
-            lambda: EXACT.mean_over_nearest(*[torch.zeros(1, 3, 2)] * 2, torch.zeros(1, 2), 2.0),
-            "fraction",
-        ),
-        ("disc at a name", lambda: Disc("home", 0.1), "corner"),
-        ("box that draws nothing", lambda: Rectangle((0, 0), (1, 1), draws=0), "draws"),
-        ("figure of no pixels", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1), "mask"),
-        ("robot of nothing", lambda: BodySpec(Disc((0.4, 0.2), 0.1), 0), "count"),
-        ("robot of no area", lambda: env(body=[(0, 0), (1, 1), (2, 2)]), "body"),
-        ("namespace of a module", lambda: dittogym.register("x", spec, namespace="a:b"), ("namespace", "'a:b'")),
-        ("namespace of two words", lambda: dittogym.register("x", spec, namespace="a b"), ("namespace", "'a b'")),
-    ]
-) + table(
-    [
-        ("unknown option", lambda: env(colour="red"), ("'colour'; its options", "body, obstacles")),
-        ("parity", lambda: env(parity="reference"), "'parity'; its options"),
-        ("single environment of three", lambda: single(num_envs=3), ("num_envs", "make_vec")),
-        ("reward of nothing", lambda: env(task=spec(reward_fn=lambda transition, spec: None)), "must return a Reward"),
-    ],
-    TypeError,
-)
+def reset(seed=None, **options):
+    return env(num_envs=2).reset(seed=seed, options=options)
+
+
+def physics(**values):
+    return reset(physics=values)
+
+
+def load(mask=None, **changes):
+    """A snapshot of an environment that differs."""
+    other = env(**{"num_envs": 2, **changes})
+    other.reset(seed=0)
+    return begun().load(other.save(), mask)
+
+
+def state(**changes):
+    """The state of an environment that differs."""
+    begun(task="catch", particles=(60, 60)).env_state = begun(**changes).env_state
+
+
+def pure(action):
+    """A step of the pure functions."""
+    made = begun()
+    return core.step(made.model, made.env_state, action)
+
+
+def pure_reset(positions, **physics):
+    return core.reset(env().model, positions, physics)
+
+
+def film(path=None, policy=lambda seen: None, **options):
+    return env().film(policy, path, **options)
+
+
+def body(given, task="run"):
+    return env(task=task, body=given)
+
+
+def target(given):
+    return make_spec("shapematch", target=given)
+
+
+def register(make, name="x"):
+    return dittogym.register(name, make)
+
+
+def returned(weights=None, start=None, **changes):
+    """A task whose reward function returns something else in a field."""
+
+    def reward_fn(transition, spec):
+        risen = {"height": transition.now.com[:, 1]}
+        return Reward(**{"terms": risen, **changes})
+
+    def remember(transition, spec):
+        return {"first": transition.now.com} if start is None else start
+
+    return env(task=spec(reward_fn=reward_fn, weights=weights or {"height": 1.0}, initial_task_state=remember))
+
+
+def json_of(shape):
+    """An environment that is made again from the JSON of its specification."""
+    made = gymnasium.make(ID, body=shape, **SMALL).spec.to_json()
+    return gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made))
+
+
+@dataclass(frozen=True)
+class Tilted(Disc):
+    """A shape of one's own."""
+
+    tilt: float = 0.0
+
+
+class OfTheGrid:
+    """A policy that was trained in another layout."""
+
+    description = {"environment": {"action_layout": "grid"}}
+
+    def predict(self, observation, state=None):
+        return None, None
+
+
+VALUES = [
+    # Environments.
+    ("task", lambda: env(task=["run"])),
+    ("task", lambda: env(task=make_spec)),
+    ("task", lambda: env(task="hope")),
+    ("num_envs", lambda: env(num_envs=1.5)),
+    ("resolution", lambda: env(resolution=8.0)),
+    ("particles[0]", lambda: env(particles=(1.5,))),
+    ("substeps", lambda: env(substeps=NAN)),
+    ("dt", lambda: env(dt=3e-4, substeps=None)),
+    ("dtype", lambda: env(dtype=torch.float16)),
+    ("device", lambda: env(device="abacus")),
+    ("action_layout", lambda: env(action_layout="page")),
+    ("resample", lambda: env(resample="no")),
+    ("render_mode", lambda: single(render_mode="ansi")),
+    ("render_mode", lambda: batch(render_mode="human")),
+    ("render_muscles", lambda: single(render_muscles="x")),
+    ("render_size", lambda: batch(render_size=0)),
+    ("autoreset_mode", lambda: batch(autoreset_mode="x")),
+    ("max_episode_steps", lambda: batch(max_episode_steps=-2)),
+    ("size", lambda: observation_resolution(batch(), 65)),
+    ("action", lambda: step(action_resolution(single(), 4), np.zeros((2, 5, 5), np.float32))),
+    # Resets, snapshots and states.
+    *(("seed", lambda seed=seed: reset(seed)) for seed in (1.5, 2**32 - 1, [1], [1, -2])),
+    ("options", lambda: env().reset(options=[1])),
+    ("'position'", lambda: reset(position=0)),
+    ("reset_mask", lambda: reset(reset_mask=[1, 0])),
+    ("reset_mask", lambda: reset(reset_mask=[True, False])),  # the first time
+    ("positions", lambda: reset(positions="x")),
+    ("positions", lambda: reset(positions=np.zeros((59, 2)))),
+    ("positions", lambda: reset(positions=np.full((60, 2), NAN))),
+    ("positions", lambda: reset(positions=np.linspace((0.0, 0.5), (2.0, 0.5), 60))),  # outside the window
+    ("physics", lambda: reset(physics=3.0)),
+    ("'nu'", lambda: physics(nu=0.3)),
+    *(
+        ("physics['mu']", lambda mu=mu: physics(mu=mu))
+        for mu in (True, "stiff", [[1.0], [1.0, 2.0]], [1.0] * 3, [1.0, -2.0])
+    ),
+    ("physics['max_actuation']", lambda: physics(max_actuation=torch.ones(2, 60))),
+    ("physics['yield_stress']", lambda: physics(yield_stress=-1.0)),
+    ("physics['lam']", lambda: physics(lam=[50.0, -5000.0])),
+    ("physics['lam']", lambda: physics(lam=-70.0, mu=torch.tensor([[60.0, 80.0]]).repeat(2, 30))),
+    *(("physics['gravity']", lambda g=g: physics(gravity=g)) for g in (-9.0, (0.0, NAN), (0.0, -1e12))),
+    *(("physics['mass']", lambda mass=mass: physics(mass=mass)) for mass in (0.0, 1e30)),
+    *(("mask", lambda mask=mask: load(mask)) for mask in ("x", [1, 0], [True])),
+    ("task", lambda: load(task="grow")),
+    ("particles", lambda: load(particles=59)),
+    ("dtype", lambda: load(dtype="float64")),
+    ("num_envs", lambda: load(num_envs=3)),
+    ("substeps", lambda: load(substeps=3)),
+    ("dt", lambda: load(dt=5e-5, substeps=1)),
+    ("obstacles", lambda: load(obstacles=())),
+    ("robot", lambda: load([True, False], body=np.ones((9, 5), bool))),
+    *(("env_state", lambda c=c: state(**c)) for c in ({"particles": 120}, {"particles": 9}, {"dtype": "float64"})),
+    # Steps, pictures and films.
+    ("action", lambda: begun().step(np.zeros((2, 2, 8, 8)))),
+    ("action", lambda: action(dtype=torch.int64)),
+    ("action", lambda: action(device="meta")),
+    ("action", lambda: begun().step(torch.zeros(2, 2, 8, 8).to_sparse())),
+    ("action", lambda: begun().step(torch.full((2, 2, 8, 8), NAN))),
+    ("action", lambda: step(single(), np.ma.masked_all((2, 8, 8)))),
+    ("action", lambda: step(single(), "left")),
+    ("action", lambda: step(single(), [[1.0], [1.0, 2.0]])),
+    ("action", lambda: step(single(), torch.zeros(2, 8, 8).to_sparse())),
+    ("action", lambda: step(batch(), np.zeros((3, 2, 8, 8)))),
+    ("soft", lambda: begun().step(torch.zeros(2, 2, 8, 8), soft="no")),
+    ("action", lambda: pure(torch.zeros(2, 2, 65, 65))),
+    ("action", lambda: pure(torch.zeros(2, 2, 8, 8, dtype=torch.float64))),
+    ("positions", lambda: pure_reset(torch.zeros(60, 2))),
+    ("physics", lambda: pure_reset(torch.full((1, 60, 2), 0.3), young=torch.ones(1))),
+    ("zoom", lambda: begun().render(zoom=1e-9)),
+    ("size", lambda: begun().render(size=3)),
+    ("policy", film),
+    ("policy", lambda: film(policy=OfTheGrid())),
+    ("path", lambda: film("film.avi")),
+    ("size", lambda: film("film.mp4", size=3)),
+    ("rate", lambda: film("film.gif", rate=0)),
+    ("speed", lambda: film("film.gif", speed=-1)),
+    ("zoom", lambda: film("film.gif", zoom=0)),
+    ("pictures", lambda: film("film.png", pictures=0)),
+    ("size", lambda: film("film.html", size=64)),  # without effect
+    ("max_steps", lambda: film(max_steps=0)),
+    ("env", lambda: trajectories.record(begun(), lambda seen: None)),
+    ("fields", lambda: trajectories.record(env(), lambda seen: None, fields=("x", "y"))),
+    ("path", lambda: trajectories.save_episodes("a.h5", [])),
+    ("episodes", lambda: trajectories.save_episodes("a.npz", [])),
+    # Bodies and obstacles.
+    ("body", lambda: body(np.zeros((8, 8), bool))),
+    ("body", lambda: body([(0, 0), (1, 0), (0, NAN)])),
+    ("body", lambda: body([(0, 0), (1, 1), (2, 2)])),
+    ("body", lambda: body("no/such/file.png")),
+    ("body", lambda: body(42)),
+    ("body", lambda: body(np.zeros((5, 5, 2), np.uint8))),
+    ("kind of a body", lambda: json_of(Tilted((0.1, 0.16), 0.15))),
+    ("robot", lambda: body(Rectangle((-0.45, 0.2), (0.1, 0.9)))),  # outside the window
+    ("robot", lambda: body(Rectangle((0.25, 0.16), (0.1, 0.1)), "kick")),  # in the object
+    ("robot", lambda: body(Rectangle((0.05, 0.1), (0.1, 0.1)))),  # in the floor
+    ("robot", lambda: body([(0, 0), (6, 0), (6, 1), (0, 1)])),  # torn from the start
+    ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Disc((0.17, 0.02), 0.06), 100),)))),
+    ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)))),
+    *(("target", lambda t=t: target(t)) for t in ("heart", 3, np.zeros((64, 64), bool), np.full((8, 8), 2.0))),
+    ("corner", lambda: Disc("home", 0.1)),
+    ("draws", lambda: Rectangle((0, 0), (1, 1), draws=0)),
+    ("mask", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1)),
+    ("count", lambda: BodySpec(Disc((0.4, 0.2), 0.1), 0)),
+    ("left and right", lambda: Box(0.5, 0.1)),
+    *(("i must", lambda i=i: solid("box", i, (0, 9))) for i in (("a", "b"), (True, 9), (9, 0))),
+    ("visible", lambda: solid("box", (0, 9), (0, 9), visible="no")),
+    ("boxes", lambda: solid("thin", (3, 5), (0, 9))),
+    ("boxes", lambda: Obstacle("nothing")),
+    ("friction", lambda: floor(friction=-1.0)),
+    ("friction", lambda: replace(floor(), friction=0.3)),  # it would have no effect
+    ("left", lambda: Window(left=0.1, follow=0.4)),
+    # Tasks.
+    ("task", lambda: register(make_spec, "run")),
+    ("task", lambda: register(dittogym.TASKS["run"])),
+    ("make", lambda: register(lambda particles=3, body=None: spec())),
+    ("variant", lambda: make_spec("slot", variant="soft")),
+    ("goal", lambda: env(task=replace(make_spec("grow"), goal=(9.0, 0.0)))),
+    ("goal", lambda: spec(goal=(1.0, 2.0, 3.0))),
+    ("target", lambda: spec(target=np.zeros((3, 3), bool))),
+    ("patch", lambda: spec(patch=200)),
+    ("objects", lambda: spec(objects=(spec().robot,) * 2)),
+    ("max_actuation", lambda: spec(max_actuation=-5.0)),
+    ("patch_centre y", lambda: spec(patch_centre=(None, "up"))),
+    ("view", lambda: spec(view=(-0.1, 0.5))),
+    ("coarse", lambda: spec(coarse=17)),
+    ("weights['action']", lambda: spec(weights={"action": -2e-4})),
+    ("weights", lambda: returned({"heigth": 7.0})),
+    ("weights", lambda: returned({"height": 7.0, "alve": 1.0})),
+    ("'height'", lambda: returned(terms={"height": torch.zeros(3)})),
+    ("terms", lambda: returned(terms={"alive": torch.zeros(2)})),
+    ("terminated", lambda: returned(terminated=torch.zeros(2, 2, dtype=torch.bool))),
+    ("success", lambda: returned(success=torch.zeros(2))),
+    ("info", lambda: returned(info={"com": torch.zeros(2)})),
+    ("'_risen'", lambda: returned(info={"_risen": torch.zeros(2)})),
+    ("'risen'", lambda: returned(info={"risen": 1.0})),
+    ("task_state", lambda: returned(task_state={"first": torch.zeros(2)})),
+    ("initial_task_state", lambda: returned(start={"peak": 1.0})),
+    ("width", lambda: EXACT.heaviside(ONE, 0.0)),
+    ("low", lambda: EXACT.clamp(ONE, 1.0, 0.5)),
+    *(("width", lambda ops=ops: ops.clamp(ONE, 0.0)) for ops in (EXACT, SMOOTH)),
+    ("width", lambda: SMOOTH.clamp(ONE, 0.0, width=0)),
+    ("fraction", lambda: EXACT.mean_over_nearest(*[torch.zeros(1, 3, 2)] * 2, torch.zeros(1, 2), 2.0)),
+    *(("point", lambda point=point: distance(torch.zeros(1, 2), point)) for point in (1.0, (0.0, 0.0, 9.0))),
+]
+TYPES = [
+    ("'colour'; its options", lambda: env(colour="red")),
+    ("'target'; its options", lambda: make_spec(make_spec("run"), target="star")),
+    ("'sped'", lambda: film("film.mp4", sped=1)),
+    ("path", lambda: film(size=64)),
+    ("num_envs", lambda: single(num_envs=3)),
+    ("env_state", lambda: setattr(begun(), "env_state", None)),
+    ("env", lambda: action_resolution(env(), 4)),
+    ("env", lambda: trajectories.record(None, lambda seen: None)),
+    ("policy", lambda: as_function(3, "image")),
+    ("make", lambda: register(5)),
+    ("make", lambda: register(lambda: None)),
+    ("'pull'", lambda: register(lambda pull: spec())),
+    ("weights", lambda: spec(weights=1.0)),
+    ("obstacles[0]", lambda: spec(obstacles=(VelocityRule("-y"),))),
+    ("obstacles", lambda: spec(obstacles=floor())),
+    ("initial_task_state", lambda: spec(initial_task_state="peak")),
+    ("reward_fn", lambda: env(task=spec(reward_fn=lambda transition, spec: None))),
+    ("terms", lambda: returned(terms=None)),
+    ("info", lambda: returned(info=[1])),
+    ("task_state", lambda: returned(task_state=torch.zeros(1))),
+    ("initial_task_state", lambda: returned(start=3.0)),
+    ("Tensor", lambda: json_of(BodySpec(Disc((0.1, 0.16), 0.15), 900, material=Elastic(torch.tensor(300.0), 50.0)))),
+]
+STATES = [
+    ("call reset() first", lambda: env().step(torch.zeros(1, 2, 8, 8))),
+    ("call reset() first", lambda: env().save()),
+    ("call reset() first", lambda: env(num_envs=2).load(begun().save(), [True, False])),
+    ("call reset() first", lambda: setattr(env(resample=True), "generators", begun(resample=True).generators)),
+]
+
+
+def cases(rows, error):
+    return table([(f"{words} {k} ({error.__name__})", call, words) for k, (words, call) in enumerate(rows)], error)
+
+
+CASES = [*cases(VALUES, ValueError), *cases(TYPES, TypeError), *cases(STATES, RuntimeError)]

@@ -7,9 +7,9 @@ import zlib
 import cv2
 import numpy as np
 import torch
-from bad_cases import TINY, Case, Refused, command, prepared
+from bad_cases import TINY, Case, Refused, command, prepared, table
 
-import baselines.evaluate
+import baselines.registry
 import cfp
 import cfp.evaluate
 import cfp.train
@@ -43,9 +43,7 @@ def target(name, content, *words):
 
 
 IMAGES = [
-    Case(
-        "image missing", lambda desk: make_spec("shapematch", target="no.png"), ("target must be", "no such", "no.png")
-    ),
+    Case("image missing", lambda desk: make_spec("shapematch", target="no.png"), ("target", "no.png")),
     target("of text", "hello", "cannot be read as an image"),
     target("all white", picture(np.full((64, 64), 255)), "pixels of the shape and of the ground, got 4096 of 4096"),
     target("that would fill the memory", png(10_000, 10_000), "at most 4194304 pixels, got 10000 x 10000"),
@@ -86,44 +84,15 @@ SHIPPED = (cfp.policy.SHIPPED / "run.safetensors").read_bytes()
 HUGE = {"x": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}
 
 POLICIES = [
-    Case(
-        "policy missing",
-        lambda desk: cfp.load("nobody"),
-        ("nobody.safetensors", "(catch, dig, grow, grow-success, kick, "),
-        CheckpointError,
-    ),
+    Case("policy missing", lambda desk: cfp.load("nobody"), ("nobody.safetensors", "grow-success"), CheckpointError),
     *(
-        Case(
-            f"policy {path!r}",
-            lambda desk, path=path: cfp.load(path),
-            ("path must be a folder, a file or the name of a policy", repr(path)),
-            CheckpointError,
-        )
+        Case(f"policy {path!r}", lambda desk, path=path: cfp.load(path), ("path must", repr(path)), CheckpointError)
         for path in (None, 5, b"run", "")
     ),
-    *(
-        Case(
-            f"policy onto {device!r}",
-            lambda desk, device=device: cfp.load("run", device=device),
-            ("device must be 'cpu' or 'cuda'", repr(device)),
-        )
-        for device in ("abacus", 1.5)
-    ),
-    *(
-        Case(
-            f"policy into {name!r}",
-            lambda desk, name=name: cfp.load("run").save(name),
-            ("path must end in .safetensors", repr(name)),
-        )
-        for name in ("run", "run.json", "run.pt")
-    ),
-    Case("run of nothing", lambda desk: cfp.Run(None), ("folder must be the path of a folder, got None",)),
-    Case("run in an unset variable", lambda desk: cfp.Run(""), ("folder must be the path of a folder, got ''",)),
-    Case(
-        "run resumed perhaps",
-        lambda desk: cfp.fit("run", resume="x", out=desk.folder / "new"),
-        ("resume must be True or False, got 'x'",),
-    ),
+    *table((f"policy onto {to!r}", lambda to=to: cfp.load("run", device=to), "device") for to in ("abacus", 1.5)),
+    *table((f"policy into {to!r}", lambda to=to: cfp.load("run").save(to), "path") for to in ("run", "run.json")),
+    *table((f"run of {given!r}", lambda given=given: cfp.Run(given), "folder") for given in (None, "")),
+    *table([("run resumed perhaps", lambda: cfp.fit("run", resume="x", out="new"), "resume")]),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
@@ -175,7 +144,7 @@ def resumed(name, change, *words):
 
 def evaluated(name, change, *words):
     """A run whose folder was changed before it is evaluated."""
-    call = command(baselines.evaluate.main, "{folder}/run --episodes 1 --device cpu")
+    call = command(cfp.evaluate.main, "{folder}/run --episodes 1 --device cpu")
     return Case(f"evaluated run with {name}", prepared(lambda desk: desk.run(change), call), words, Refused)
 
 

@@ -10,9 +10,9 @@ SMALL = "--particles 100 --substeps 1 --eval-episodes 1 --no-video --device cpu"
 PROGRAMS = {
     "train": ("cfp.train", TINY + NEW),
     "learn": ("baselines.train", SMALL + NEW),
-    "distill": ("baselines.distill", SMALL + " --train-particles 100" + NEW),
+    "distill": ("baselines.train", "--algo distill " + SMALL + " --train-particles 100" + NEW),
     "evaluate": ("cfp.evaluate", "--device cpu "),
-    "disturb": ("baselines.robustness", "--device cpu "),
+    "disturb": ("cfp.robustness", "--device cpu "),
     "compare": ("baselines.compare.__main__", NEW),
     "rank": ("baselines.leaderboard", NEW),
 }
@@ -113,7 +113,6 @@ OTHERS = (
         "distill",
         ("--teacher run", "teacher must be a policy for shapematch"),
         ("--num-layouts 5000", "num_layouts must be at most"),
-        ("--capacity 0", "capacity must be at least 1, got 0"),
     )
     + rows(
         "evaluate",
@@ -160,10 +159,10 @@ OTHERS = (
         planned({"colour": 1}, "must hold common, tasks and algos only, got colour"),
         planned({"common": {"seed": 5}}, "plan: common must not hold seed"),
         planned({"algos": {"cfp-sac": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp-sac.t"),
-        planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "--colour"),
+        planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "colour"),
         Case(
             "evaluate an empty folder",
-            command(main_of("baselines.evaluate"), "{folder}"),
+            command(main_of("cfp.evaluate"), "{folder}"),
             ("there is no run",),
             Refused,
         ),

@@ -1,6 +1,8 @@
-"""Comparisons: tiny plans in processes of their own, interrupted ones among them, and the report about them."""
+"""Comparisons: tiny plans, in processes of their own where that matters, and the report about them."""
 
+import contextlib
 import csv
+import io
 import json
 import os
 import signal
@@ -19,8 +21,9 @@ from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
 from baselines.compare.plan import Run, make_runs, read_plan, to_words
 from baselines.compare.processes import LocalExecutor, Resources, carry_out
-from baselines.compare.report import align, make_table, paired_differences, read_result, t_interval, write_report
+from baselines.compare.report import align, make_table, paired_differences, read_result, write_report
 from cfp.errors import ConfigError
+from cfp.evaluation.returns import t_interval
 from cfp.files import write_json, write_text
 from cfp.tables import read_table
 
@@ -31,18 +34,34 @@ PLAN = {
     "common": {"particles": 100, "substeps": 1, "num_envs": 1, "eval_episodes": 1},
     "algos": {
         "mpc": MPC,
-        "shac-image": {"algo": "shac", "sees": "image", **SHAC, "eval_every": 24, "checkpoint_every": 12},
+        "shac-wide": {"algo": "shac", "noise": 0.3, **SHAC, "eval_every": 24, "checkpoint_every": 12},
     },
 }
 COMMON = "--device cpu --episodes 2 --particles 100 --cpus-per-run 1".split()
-ALGOS = "--algos zero shac-image --seeds 0 1".split()
-NAMES = [f"{name}-shapematch-quick-{seed}" for name, seed in (("zero", 0), ("shac-image", 0), ("shac-image", 1))]
+ALGOS = "--algos zero shac-wide --seeds 0 1".split()
+NAMES = [f"{name}-shapematch-quick-{seed}" for name, seed in (("zero", 0), ("shac-wide", 0), ("shac-wide", 1))]
 
 
-@pytest.fixture(autouse=True)
-def packages_of_this_folder(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def packages_of_this_folder():
     """Also in the processes of the runs."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+        yield
+
+
+def call_here(words, run, threads, urgency):
+    """Stands for `processes._call`: the run takes place in this process, which saves a start of Python."""
+    output = io.StringIO()
+    values = json.loads(words[-1])
+    with contextlib.redirect_stderr(output):
+        code = worker.train_and_evaluate(run, Protocol(**values["protocol"]))
+    return code, output.getvalue().rstrip().rpartition("\n")[2]
+
+
+@pytest.fixture
+def here(monkeypatch):
+    monkeypatch.setattr(processes, "_call", call_here)
 
 
 def words(out, *more, plan=PLAN):
@@ -66,10 +85,11 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A comparison of a reference policy and trainings with two seeds."""
+    """A comparison of a reference policy, in a process of its own, and of trainings with two seeds."""
     out = tmp_path_factory.mktemp("compare") / "whole"
+    assert compare(out, "--algos", "zero", "--seeds", "0") == 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+        patch.setattr(processes, "_call", call_here)
         assert compare(out, *ALGOS) == 0
     return out
 
@@ -81,21 +101,22 @@ def test_every_policy_plays_the_same_episodes_and_all_are_reported(finished):
     for row in table:
         layouts[row["algorithm"], row["seed"]].append(row["layout"])
     assert len(layouts) == 3 and {tuple(each) for each in layouts.values()} == {("20000", "20001")}
-    assert {(row["algorithm"], row["observes"]) for row in table} == {("zero", "nothing"), ("shac-image", "image")}
+    assert {(row["algorithm"], row["observes"]) for row in table} == {("zero", "nothing"), ("shac-wide", "state")}
     report, page = (finished / "report.md").read_text(), (finished / "index.html").read_text()
     for text in (report, page):
-        assert "3 of 3 runs are finished and evaluated." in text and "shac-image" in text
+        assert "3 of 3 runs are finished and evaluated." in text and "shac-wide" in text
     assert "http" not in page and (finished / "returns.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_evaluation_is_that_of_the_policy_alone(finished):
     """Each episode can be asked for by itself and is the same to the last bit."""
     options = json.loads((finished / "runs" / NAMES[1] / "comparison.json").read_text())["options"]
-    run = Run("shac-image", "shapematch", 0, options, finished / "runs" / NAMES[1])
+    run = Run("shac-wide", "shapematch", 0, options, finished / "runs" / NAMES[1])
     found = run.record["evaluation"]
     run.update_record(evaluation={})
     for episodes in (1, 2):
         evaluate_run(run, Protocol(episodes, 100))
+        assert run.record["evaluation"]["returns"] == found["returns"][:episodes]
     assert run.record["evaluation"] == found
     evaluate_run(run, Protocol(1, 100, "with"))
     assert run.record["evaluation"]["noise"] and len(run.record["evaluation"]["returns"]) == 1
@@ -113,14 +134,14 @@ def test_what_is_finished_is_left_alone_and_listed(finished, capsys):
 
 
 def test_other_options_are_refused_and_named(finished, capsys):
-    plan = {**PLAN, "algos": {"shac-image": {**PLAN["algos"]["shac-image"], "window": 8}}}
+    plan = {**PLAN, "algos": {"shac-wide": {**PLAN["algos"]["shac-wide"], "window": 8}}}
     assert compare(finished, *ALGOS, plan=plan) == 2
     assert "window must be 6 as in the run in" in capsys.readouterr().err
     without_influence = {**PLAN, "common": {**PLAN["common"], "log_every": 7}}
     assert compare(finished, *ALGOS, "--dry-run", plan=without_influence) == 0
 
 
-def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, tmp_path):
+def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, here, tmp_path):
     out = tmp_path / "out"
     for number in (0, 1):
         assert compare(out, "--algos", "zero", "mpc", "--seeds", "0", "--only", str(number)) == 0
@@ -135,7 +156,7 @@ def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, tmp_pat
     assert own["own_layout"] not in own["returns"]  # on the only layout that it is made for
 
 
-def test_failed_run_is_reported_and_stops_no_other(tmp_path, capsys):
+def test_failed_run_is_reported_and_stops_no_other(here, tmp_path, capsys):
     damaged = tmp_path / "out" / "runs" / "mpc-shapematch-quick-0" / "checkpoint" / "state.pt"
     write_text(damaged, "no checkpoint")
     assert compare(tmp_path / "out", "--algos", "mpc", "zero", "--seeds", "0") == 1
@@ -223,7 +244,7 @@ def test_a_process_that_fails_leaves_a_reason_and_a_killed_one_is_started_again(
     run.folder.mkdir()
     for name in ("error.txt", "log.txt"):
         (run.folder / name).write_text("of an earlier attempt\n")
-    assert carry_out(run, Protocol(), Resources(retries=2)) == outcome and run.error == reason
+    assert carry_out(run, Protocol(), Resources()) == outcome and run.error == reason
     if "SIGKILL" in reason:
         assert Path("count").read_text() == "xxx"
 
@@ -241,12 +262,13 @@ def test_a_process_is_asked_to_stop_before_it_is_killed(run, use_program, urgenc
     assert urgency == 2 or Path("ended").exists()
 
 
-def test_a_folder_in_use_is_left_alone(finished):
+def test_a_folder_in_use_is_left_alone(finished, monkeypatch):
+    monkeypatch.setattr(worker, "WAIT", 0.0)
     folder = finished / "runs" / NAMES[0]
     options = json.loads((folder / "comparison.json").read_text())["options"]
     before = (folder / "comparison.json").read_bytes()
     with FileLock(folder / ".comparison.lock"):
-        code = worker.carry_out(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100), wait=0.0)
+        code = worker.train_and_evaluate(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100))
     assert code == worker.IN_USE and (folder / "comparison.json").read_bytes() == before
 
 
@@ -274,11 +296,14 @@ def test_the_narrower_section_of_a_plan_wins():
     plan = {
         "common": {"algo": "coarse", "num_envs": 2, "eval_every": 500},
         "tasks": {"run": {"eval_every": 600}},
-        "algos": {"shac": {"num_envs": 4, "tasks": {"run": {"steps": 480}}}, "long": {"tasks": {"run": {"alpha": 1}}}},
+        "algos": {
+            "shac": {"num_envs": 4, "tasks": {"run": {"steps": 480}}},
+            "long": {"tasks": {"run": {"alpha": [1.0]}}},
+        },
     }
     shac, long = (run.options for run in runs_of(plan, "shac", "long", steps=96000))
     assert (shac["algo"], shac["num_envs"], shac["eval_every"], shac["steps"]) == ("shac", 4, 600, 480)
-    assert (long["algo"], long["num_envs"], long["alpha"], long["steps"]) == ("coarse", 2, 1, 96000)
+    assert (long["algo"], long["num_envs"], long["alpha"], long["steps"]) == ("coarse", 2, [1.0], 96000)
     assert "steps" not in runs_of({}, "gradient", steps=960)[0].options
 
 
@@ -360,6 +385,7 @@ def written(folder, label, seed, returns, observes="image", curve=None):
     layouts, successes = list(range(20000, 20000 + len(returns))), [value > 5 for value in returns]
     evaluation = {
         "policy": label if label == "zero" else "",
+        "episodes": len(returns),
         "particles": "lite",
         "noise": True,
         "observes": observes,
@@ -405,7 +431,7 @@ def test_evaluations_under_another_protocol_do_not_count(tmp_path):
     run = written(tmp_path, "shac", 0, [4.0, 6.0], "state", {500: 1})
     protocols = (Protocol(1), Protocol(3), Protocol(2, "full"), Protocol(2, "lite", "without"))
     found = [read_result(run, protocol).state for protocol in protocols]
-    assert found == ["finished", "not evaluated", "not evaluated", "not evaluated"]
+    assert found == ["not evaluated"] * 4 and read_result(run, Protocol(2)).state == "finished"
     write_text(run.folder / "policy.safetensors", "another")
     assert read_result(run, Protocol(2)).state == "not evaluated"
     assert [Protocol().deterministic(task) for task in ("shapematch", "run", "module:own")] == [True, False, False]

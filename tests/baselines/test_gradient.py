@@ -121,7 +121,7 @@ def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
     assert gradient.isfinite().all() and gradient[:4].abs().amax((1, 2, 3)).gt(0).all() and not gradient[4:].any()
 
 
-@pytest.mark.parametrize("loss", [math.nan, math.inf, 1e3])
+@pytest.mark.parametrize("loss", [math.nan, 1e3])
 def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     learner = Gradient(make(substeps=1, blur=(1.0,)))
     learn(learner, 30)

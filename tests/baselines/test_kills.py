@@ -21,7 +21,7 @@ KILLS = int(os.environ.get("KILLS", "3"))
 #: Seconds after its first words within which a training is killed.
 SPAN = 3.0
 #: Long enough that most kills hit the training itself.
-STEPS = {"cfp": "--steps 160 --handover 80", "shac": "--steps 480", "distill": "--steps 160 --handover 80"}
+STEPS = {"cfp-sac": "--steps 160 --handover 0.5", "shac": "--steps 480", "distill": "--steps 160 --handover 0.5"}
 TABLES = ("evaluations.csv", "progress.csv", "results.json")
 
 

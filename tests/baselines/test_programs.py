@@ -11,8 +11,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import baselines
 import dittogym
-from baselines import OpenLoop, evaluate, replay, robustness, train
+from baselines import OpenLoop, train
 from baselines.registry import configure, find, sees
+from cfp import evaluate, robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.envs.disturbances import make_cases
@@ -26,49 +27,49 @@ pytestmark = pytest.mark.usefixtures("short")
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 REWARDS = (
-    "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
+    "--num-envs 2 --steps 40 --random-steps 8 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
     "--eval-every 20 --checkpoint-every 10 --log-every 10"
 )
 WINDOWS = (
-    "--train-particles 100 --num-envs 2 --steps 96 --window 6 --critic-updates 2 --eval-every 48 --checkpoint-every 12 "
-    "--log-every 24"
+    "--train-particles 100 --num-envs 2 --steps 48 --window 6 --critic-updates 2 --eval-every 24 --checkpoint-every 12 "
+    "--log-every 12"
 )
 PLANNED = "--grid 8 --horizon 3 --commit 2 --eval-every 3 --checkpoint-every 2 --log-every 2"
 # A tiny run of each algorithm: options, a step at which it is stopped, its policies.
 TINY = {
     "cfp-analytic": (
         f"{WINDOWS} --handover 0.5 --resolutions 4 8 --minibatches 2 --minibatch-size 8",
-        60,
+        36,
         ["stage 1", "stage 2"],
     ),
-    "cfp-sac": (f"{REWARDS} --resolutions 4 8 --handover 0.5 --random-steps 10 4", 44, ["stage 1", "stage 2"]),
-    "coarse": (f"{REWARDS} --resolutions 8", 44, ["stage 1"]),
-    "fine": (f"{REWARDS} --resolutions 8", 44, ["stage 1"]),
-    "gnn-16": (REWARDS, 44, ["stage 1"]),
-    "gnn-64": (REWARDS, 44, ["stage 1"]),
-    "transformer-16": (REWARDS, 44, ["stage 1"]),
-    "transformer-64": (REWARDS, 44, ["stage 1"]),
+    "cfp-sac": (f"{REWARDS} --resolutions 4 8 --handover 0.5 --random-steps 8 4", 34, ["stage 1", "stage 2"]),
+    "coarse": (f"{REWARDS} --resolutions 8", 34, ["stage 1"]),
+    "fine": (f"{REWARDS} --resolutions 8", 34, ["stage 1"]),
+    "gnn-16": (REWARDS, 34, ["stage 1"]),
+    "gnn-64": (REWARDS, 34, ["stage 1"]),
+    "transformer-16": (REWARDS, 34, ["stage 1"]),
+    "transformer-64": (REWARDS, 34, ["stage 1"]),
     "distill": (
         "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
-        "--resolutions 4 8 --steps 60 --handover 0.5 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--resolutions 4 8 --steps 40 --handover 0.5 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
         "--checkpoint-every 10 --log-every 10",
-        50,
+        34,
         ["stage 1", "stage 2"],
     ),
     "gradient": (
-        "--iterations 5 --grid 4 --train-particles 100 --polish 3 --polish-grid 8 "
-        "--eval-every 24 --checkpoint-every 8 --log-every 8",
-        48,
+        "--iterations 3 --grid 4 --train-particles 100 --polish 2 --polish-grid 8 "
+        "--eval-every 16 --checkpoint-every 8 --log-every 8",
+        32,
         ["stage 1", "stage 2", "  own layout"],
     ),
     "mpc": (f"{PLANNED} --iterations 1 --train-particles 60", 5, ["stage 1", "  own layout"]),
     "cem": (f"{PLANNED} --iterations 2 --candidates 5 --elites 2", 5, ["stage 1", "  own layout"]),
-    "shac": (f"{WINDOWS} --grid 8 --max-episode-steps 6", 60, ["stage 1"]),
+    "shac": (f"{WINDOWS} --grid 8 --max-episode-steps 6", 36, ["stage 1"]),
 }
-#: The same programs as with 16 segments, and several times slower; and as coarse, with another grid.
-LARGE = {"gnn-64", "transformer-64", "fine"}
-#: The same programs as cfp-sac, mpc and gnn-16, with a single stage, another planner and other networks.
-ALIKE = {"coarse", "cem", "transformer-16"}
+#: The same programs as gnn-16 and coarse, with more segments, other networks and another grid.
+LARGE = {"gnn-64", "transformer-16", "transformer-64", "fine"}
+#: The same programs as cfp-sac and mpc, with a single stage and another planner.
+ALIKE = {"coarse", "cem"}
 #: Algorithms whose policies are those of the coarse-to-fine method.
 LEVELS = ("cfp-analytic", "cfp-sac", "coarse", "distill", "fine")
 
@@ -105,7 +106,7 @@ def test_run_leaves_its_files(finished):
     assert [row["policy"] for row in rows] == ["zero action", "random action", *TINY[algo][2]]
 
 
-def test_policy_is_loaded_by_its_kind_and_evaluated(finished, capsys):
+def test_policy_is_loaded_by_its_kind_and_evaluated(finished, tmp_path, capsys):
     algo, folder = finished
     images, policy = np.zeros((3, 3, 64, 64), np.uint8), baselines.load(folder)
     if isinstance(policy, StatePolicy):
@@ -117,8 +118,10 @@ def test_policy_is_loaded_by_its_kind_and_evaluated(finished, capsys):
     size = 64 if algo.startswith(("gnn", "transformer")) else 8
     assert policy.description["resolution"] == size and policy.description["task"] == "shapematch"
     capsys.readouterr()
-    assert evaluate.main([str(folder), "--episodes", "2", "--json", "--device", "cpu"]) == 0
+    words = ["--episodes", "2", "--json", "--device", "cpu", "--replay", str(tmp_path / "replay.html")]
+    assert evaluate.main([str(folder), *words]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
+    assert "<!doctype html>" in (tmp_path / "replay.html").read_text()[:100].lower()
 
 
 @pytest.mark.parametrize("finished", algorithms(slow=LARGE | ALIKE), indirect=True)
@@ -147,15 +150,6 @@ def test_robustness_is_reported_whatever_trained_it(finished, monkeypatch):
     rows = json.loads((folder / "robustness.json").read_text())
     assert rows[0]["case"] == "unperturbed" and {row["episodes"] for row in rows} == {1}
     assert baselines.load(folder).uses_image == any("observation" in row["case"] for row in rows)
-
-
-@pytest.mark.parametrize("finished", ["gnn-16"], indirect=True)
-def test_episode_is_written_to_watch(finished, tmp_path, capsys):
-    page = tmp_path / "replay.html"
-    assert replay.main([str(finished[1]), "--out", str(page)]) == 0
-    assert "<!doctype html>" in page.read_text()[:100].lower()
-    assert replay.main([str(finished[1]), "--out", "replay.txt"]) == 2
-    assert "out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("finished", ["gradient"], indirect=True)
@@ -203,9 +197,9 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
     config = configure({"algo": "coarse", "resolutions": [8], "substeps": 1, "encoder": "paper"})
     start = tmp_path / "start.safetensors"
     save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)
-    words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
+    words = ["--refine", "--start-from", str(start), "--resolutions", "8", "--steps", "24", "--eval-every", "24"]
     stop_at(12)
-    assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
+    assert run("cfp-analytic", tmp_path / "run", *words, "--warmup", "0") == 128 + signal.SIGINT
     assert baselines.load(tmp_path / "run").description["steps"] == 0
     monkeypatch.undo()
     start.unlink()
@@ -232,7 +226,6 @@ SAC = {"num_envs": 2, "batch_size": 4, "buffer_size": 60, "update_start": 8}
 TEACHING = {"teacher": "mpc", "planner_grid": 4, "horizon": 2, "commit": 2, "iterations": 1, "rollout_steps": 4}
 CONFORMS = {
     "shac": SHAC,
-    "shac image": SHAC | {"sees": "image"},
     "coarse": SAC | {"resolutions": [8], "random_steps": [4]},
     "gnn-16": SAC | {"random_steps": 4},
     "distill": TEACHING | {"num_envs": 2, "train_particles": 100, "resolutions": [8], "updates": 1, "batch_size": 4},
@@ -241,9 +234,8 @@ CONFORMS = {
 
 @pytest.mark.parametrize("name", CONFORMS)
 def test_algorithm_is_one_of_stable_baselines3(name, tmp_path):
-    algo, more = name.split()[0], CONFORMS[name]
-    config = configure({"algo": algo, "particles": 100, "substeps": 1, "device": "cpu", **more})
-    model = find(algo).create(config, 1, tmp_path)
+    config = configure({"algo": name, "particles": 100, "substeps": 1, "device": "cpu", **CONFORMS[name]})
+    model = find(name).create(config, 1, tmp_path)
     stops = StopsAfter(5)
     model.learn(100, stops)
     assert stops.n_calls == 5 and model.num_timesteps == 10

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policy_files import save_actor
 from updates import learn
 
 import baselines
 import baselines.shac
 from baselines import Shac, StatePolicy
-from baselines.registry import configure
 from baselines.shac import METRICS
-from cfp.agent.actor import ActorSpec, build_actor
 from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
@@ -44,7 +41,6 @@ def parameters(learner):
         ({"gamma": 1.5}, "gamma.*1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"split_margin": -0.5}, "split_margin.*-0.5"),
-        ({"start_from": "run"}, "start_from.*sees"),
     ],
 )
 def test_bad_options_are_named(changes, named):
@@ -74,14 +70,12 @@ def speed(learner, steps=32):
     return (env.env_state.centre[0, 0].item() - start) / (steps * 0.01)
 
 
-@pytest.mark.parametrize("sees", ["state", "image"])
-def test_gradient_of_the_window_is_that_of_the_loss(sees):
-    learner = make(dtype="float64", sees=sees, noise=0.0)
+def test_gradient_of_the_window_is_that_of_the_loss():
+    learner = make(dtype="float64", noise=0.0)
     learner.actor.double(), learner.critic.target.double()
     env = learner.simulation
-    inputs = {"state": lambda: learner.features(env), "image": lambda: env.soft_observation() * (2.0 / 255.0) - 1.0}
-    learner.collector.observe = inputs[sees]
-    weight, start = [p for p in learner.actor.parameters() if p.requires_grad][-1], env.save()
+    learner.collector.observe = lambda: learner.features(env)
+    weight, start = [*learner.actor.parameters()][-1], env.save()
 
     def loss():
         env.load(start)
@@ -164,13 +158,12 @@ def test_targets_are_those_of_td_lambda():
     assert td_lambda_targets(window((False, True, False)), 0.5, 0.25)[1].item() == 2 + 0.5 * 8
 
 
-@pytest.mark.parametrize("sees", ["state", "image"])
-def test_policy_goes_through_its_file(sees, tmp_path):
-    learner, path = make("shapematch", sees=sees, grid=8), tmp_path / "policy.safetensors"
+def test_policy_goes_through_its_file(tmp_path):
+    learner, path = make("shapematch", grid=8), tmp_path / "policy.safetensors"
     learn(learner, 8)
     learner.save_policy(path, describe_run(learner.config, "shac", 1, 8))
     policies = learner.trained_policy, baselines.load(path)
-    assert policies[1].description["sees"] == sees and policies[1].resolution == 8
+    assert policies[1].description["kind"] == "shac" and policies[1].resolution == 8
     env = make_env(learner.config, 8, 2)
     images = env.reset()
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in policies]
@@ -178,27 +171,6 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     trials = [make_trial(learner.config, "", each, 2, deterministic=False, seed=3) for each in policies]
     results = evaluate(trials)
     assert results[0] == results[1]
-
-
-def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
-    config, path = options(sees="image"), tmp_path / "policy.safetensors"
-    actor = build_actor(ActorSpec((config.resolution(1),)))
-    trained = configure({"algo": "coarse", "task": "run", "encoder": "paper", "substeps": 4})
-    save_actor(path, actor, replace(trained, resolutions=(config.resolution(1),)), 1, 5)
-    warm = replace(config, start_from=str(path))
-    Shac.begin(warm, tmp_path)
-    path.unlink()  # the run has its own copy
-    learner = Shac.create(warm, 1, tmp_path)
-    assert learner.starts_trained and not Shac.create(config, 1, tmp_path).starts_trained
-    for name, value in actor.state_dict().items():
-        if not name.startswith("std."):
-            assert torch.equal(learner.actor.actor.state_dict()[name], value), name
-    images = torch.randint(0, 256, (40, 3, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    torch.manual_seed(0)
-    spread = torch.stack([learner.trained_policy(images).atanh() for _ in range(30)]).std(0).mean()
-    assert spread == pytest.approx(0.105, rel=0.05)  # not that of the policy, which nothing would change any more
-    with pytest.raises(ConfigError, match=r"start_from.*kick"):
-        Shac.begin(replace(warm, task="kick", start_from="run"), tmp_path)
 
 
 def test_policy_of_the_state_says_what_it_needs(tmp_path):

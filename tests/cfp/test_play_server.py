@@ -12,18 +12,22 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import tyro
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-import cfp
+from baselines import OpenLoop
+from baselines.registry import configure
 from cfp.play import __main__ as program
 from cfp.play.protocol import HEAD
 from cfp.play.server import LARGEST_NUMBER, Pace, Server
 from cfp.play.session import Session
+from cfp.policy import describe_run
 
 SMALL: dict[str, Any] = {"particles": 200, "substeps": 10}
 MALFORMED = ["", "null", '{"type": "play"}', '{"type": "policy", "name": "../../etc/passwd"}']
@@ -231,15 +235,12 @@ def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
             assert error.startswith("error: ") and message in error and error.count("\n") == 1
 
 
-def test_policies_are_read_by_the_given_loader(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Server, "run", lambda self: self._socket.close())
-    read: list[str] = []
-
-    def load(path: str) -> Any:
-        read.append(path)
-        return cfp.load(path)
-
-    assert program.main(["--policy", "run", "--particles", "200", "--no-browser"], load) == 0 and read == ["run"]
+def test_policies_of_other_algorithms_are_played_where_these_are_registered(tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    config = configure({"algo": "gradient", "task": "run"})
+    OpenLoop(torch.zeros(3, 2, 4, 4), describe_run(config, "gradient", 1, 0)).save(path)
+    read = program.options(program.Command(policy=str(path)))["policies"][str(path)]
+    assert isinstance(read(), OpenLoop)
 
 
 def test_without_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

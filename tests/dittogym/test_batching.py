@@ -5,9 +5,9 @@ import random
 import numpy as np
 import pytest
 import torch
-from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, stir, tiny
+from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, set_particles, stir, tiny
 
-from dittogym import BatchEnv, TorchEnv
+from dittogym import BatchEnv, TorchEnv, core
 from dittogym.core import FAILURE_REWARD
 
 
@@ -88,18 +88,13 @@ def test_an_episode_repeats_bit_by_bit(task: str) -> None:
     assert_same_bits(episode(task), episode(task))
 
 
-def test_the_cpu_is_deterministic() -> None:
-    for backend in ("auto", "eager"):
-        assert tiny("run", deterministic=True, backend=backend).num_particles == 120
-
-
 def spoil(env: TorchEnv, how: str) -> None:
     """Make element 1 unable to go on."""
     state = env.state
-    if how in ("nan", "inf"):
-        state.v[1, 7] = float(how)
-    elif how == "shape":
-        state.F[1, -1, 0, 0] = torch.nan
+    if how in ("x", "v", "C", "F", "Jp"):  # a number of a particle of the robot, or of the object where there is one
+        getattr(state, how)[1, -1 if how in ("C", "F") else 7].view(-1)[0] = torch.nan
+    elif how == "inf":
+        state.v[1, 7] = torch.inf
     elif how == "shot":
         state.v[1] = 1e300
     else:
@@ -108,7 +103,7 @@ def spoil(env: TorchEnv, how: str) -> None:
         state.x[1, robot, axis] += distance
 
 
-WAYS = [(task, how) for task in TASKS for how in ("nan", "inf", "shape", "shot", "up", "down")]
+WAYS = [(task, how) for task in TASKS for how in ("x", "v", "C", "F", "Jp", "inf", "shot", "up", "down")]
 WAYS += [(task, how) for task in FIXED for how in ("left", "right")]
 
 
@@ -193,3 +188,16 @@ def test_a_reset_of_no_element_changes_nothing(backend: str) -> None:
     before, _ = env.reset(seed=0)
     seen, _ = env.reset(options={"reset_mask": [False, False]})
     assert torch.equal(seen, before)
+
+
+@pytest.mark.parametrize("shift", [(3.0, 0.0), (0.0, -3.0), (0.0, 3.0)])
+def test_one_particle_of_the_robot_in_the_window_is_enough(shift: tuple[float, float]) -> None:
+    """The object does not count."""
+    env = tiny("kick", 2)
+    env.reset(seed=0)
+    x, robot = env.state.x.clone(), env.model.num_robot_particles
+    x[1, :robot] += torch.tensor(shift)
+    for valid in (False, True):
+        set_particles(env, x=x)
+        assert core.is_valid(env.model, env.env_state).tolist() == [True, valid]
+        x[1, robot - 1] = env.state.x[0, 0]

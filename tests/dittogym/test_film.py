@@ -51,10 +51,12 @@ def test_a_recording_is_the_episode(recording: Recording) -> None:
     assert recording.default_speed == 0.05  # 4 s
 
 
-def test_without_the_packages_for_mp4_no_episode_is_played(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_what_cannot_be_written_is_not_played(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     monkeypatch.setattr("dittogym.render.film.find_spec", lambda name: None)
-    with pytest.raises(VideoUnavailable, match="MP4"):
-        dittogym.TorchEnv("kick", **SMALL).film(lambda observation: pytest.fail("played"), tmp_path / "film.mp4")
+    env = dittogym.TorchEnv("kick", **SMALL)
+    for path, options, error in (("film.mp4", {}, VideoUnavailable), ("film.gif", {"rate": 0}, ValueError)):
+        with pytest.raises(error):
+            env.film(lambda observation: pytest.fail("played"), tmp_path / path, **options)
 
 
 @pytest.mark.parametrize("limit", [3, 50])
@@ -64,8 +66,6 @@ def test_a_recording_stops_after_some_steps(limit: int, single: bool) -> None:
     env = dittogym.Env(spec, **SMALL) if single else dittogym.TorchEnv(spec, 2, **SMALL)
     film = env.film(wave, max_steps=limit)
     assert len(film.rewards) == len(film.shots) - 1 == min(limit, 5)
-    with pytest.raises(ValueError, match="max_steps"):
-        env.film(wave, max_steps=0)
 
 
 @pytest.mark.parametrize("suffix", ["gif", "webp", "mp4"])
@@ -170,34 +170,6 @@ def test_policies_are_functions_or_predict() -> None:
     assert [act(None), act(None)] == [(False, None), (False, 1)]
     policy.deterministic_by_default = True
     assert as_function(policy, "image")(None) == (True, None)
-    with pytest.raises(TypeError, match="policy must"):
-        as_function(3, "image")
-    policy.description = {"environment": {"action_layout": "grid"}}
-    with pytest.raises(ValueError, match="policy must"):
-        as_function(policy, "image")
-    as_function(policy, "grid")
-
-
-@pytest.mark.parametrize(
-    ("options", "argument"),
-    [
-        ({"path": "film.avi"}, "path"),
-        ({"path": "film.mp4", "size": 3}, "size"),
-        ({"path": "film.mp4", "rate": 0}, "rate"),
-        ({"path": "film.mp4", "speed": -1}, "speed"),
-        ({"path": "film.mp4", "zoom": 0}, "zoom"),
-        ({"path": "film.png", "pictures": 0}, "pictures"),
-        ({"path": "film.html", "size": 64}, "size"),  # without effect
-        ({"path": "film.png", "speed": 1}, "speed"),
-        ({"path": "film.webp", "pictures": 4}, "pictures"),
-        ({"size": 64}, "path"),
-        ({"path": "film.mp4", "sped": 1}, "'sped'"),
-    ],
-)
-def test_options_are_checked_before_the_episode(options: dict, argument: str) -> None:
-    env = dittogym.TorchEnv("run", **SMALL)
-    with pytest.raises((ValueError, TypeError), match=argument):
-        env.film(lambda observation: pytest.fail("played"), **options)
 
 
 def decode(page: str) -> tuple[dict, np.ndarray, dict[str, np.ndarray]]:

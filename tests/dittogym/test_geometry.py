@@ -10,19 +10,6 @@ import dittogym
 from dittogym.geometry import Obstacle, floor, side_walls, solid
 
 
-def test_bad_geometry() -> None:
-    for call, name in (
-        (lambda: solid("thin", (3, 5), (0, 9)), "boxes"),
-        (lambda: floor(friction=-1.0), "friction"),
-        (lambda: Obstacle("nothing"), "boxes"),
-        (lambda: dataclasses.replace(floor(), friction=0.3), "friction"),  # it would have no effect
-    ):
-        with pytest.raises(ValueError, match=name):
-            call()
-    with pytest.raises(TypeError, match="takes body and obstacles"):
-        dittogym.make_spec(dittogym.make_spec("run"), target="star")
-
-
 @pytest.mark.parametrize("obstacle", [floor(), solid("box", (60, 66), (None, 24), friction=math.inf), side_walls(60)])
 def test_another_friction(obstacle: Obstacle) -> None:
     rules = obstacle.with_friction(0.3).velocity_rules

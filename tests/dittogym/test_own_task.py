@@ -1,12 +1,9 @@
 """A task of one's own, registered without touching the library."""
 
 import dataclasses
-import hashlib
 import math
-import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from types import MappingProxyType
 
 import gymnasium
@@ -22,8 +19,8 @@ from dittogym.bodies.shapes import Disc, Figure, Rectangle
 from dittogym.geometry import Window, ceiling, floor, solid
 from dittogym.rewards import Reward, Transition
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.tasks import fingerprint, headline
-from torchmpm import Elastic, Snow, VelocityRule
+from dittogym.tasks import headline
+from torchmpm import Elastic, Snow
 
 
 @pytest.fixture(autouse=True)
@@ -97,8 +94,6 @@ def test_options_of_the_function_arrive() -> None:
     env = gymnasium.make("dittogym/hop-coarse-v0", pull=-1.5, coarse=6, body=Disc((0.4, 0.16), 0.1), **SMALL)
     spec = env.unwrapped.torch_env.spec
     assert (spec.gravity, spec.robot.shape.size, env.action_space.shape) == ((0.0, -1.5), (0.1, 0.1), (2, 6, 6))
-    with pytest.raises(TypeError, match="'push'; its options are body, obstacles, pull"):
-        gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
     single, batch = gymnasium.make("dittogym/hop-coarse-v0", horizon=3, **SMALL), make_vec("hop", horizon=3)
     single.reset(seed=0), batch.reset(seed=0)
     assert [single.step(np.zeros((2, 4, 4), np.float32))[3] for _ in range(3)] == [False, False, True]
@@ -122,6 +117,7 @@ def test_a_longer_limit_than_the_horizon() -> None:
 
 
 def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypatch) -> None:
+    """By ``MODULE:NAME``, and by a process that gets nothing but the specification of the environment as JSON."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "hopping.py").write_text(
         "import dataclasses, dittogym\n"
@@ -132,76 +128,32 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "hidden.py").write_text("raise AssertionError('is never imported')")
     assert tiny("hopping:leap", substeps=1).spec.name == "leap"
+    text = gymnasium.spec("dittogym/leap-coarse-v0").to_json()
+    del dittogym.TASKS["leap"], gymnasium.registry["dittogym/leap-coarse-v0"], sys.modules["hopping"]
+    made = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(text), **SMALL)
+    assert repr(made.unwrapped.torch_env) == "TorchEnv('leap', 1, 8, device='cpu')"
     for task, reason in (
         ("hopping:fly", "does not register 'fly'"),
         ("torn:leap", "ZeroDivisionError"),
         ("missing_one:leap", "No module named 'missing_one'"),
         ("folder.hidden:leap", "without dots"),
         ("folder:fly", "does not register 'fly'"),
-        ("hope", "got 'hope'"),
     ):
-        with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME.*{reason}"):
+        with pytest.raises(ValueError, match=f"task must be .*{reason}"):
             dittogym.make_spec(task)
 
 
-def test_another_process_makes_the_task_from_its_specification(tmp_path: Path) -> None:
-    (tmp_path / "jumping.py").write_text(
-        "from dataclasses import replace\nimport dittogym\n"
-        "def jump():\n    return replace(dittogym.make_spec('run'), name='jump')\n"
-        "dittogym.register('jump', jump)\n"
-    )
-    first = "import gymnasium, jumping; print(gymnasium.spec('dittogym/jump-coarse-v0').to_json())"
-    second = (
-        "import sys, gymnasium; from gymnasium.envs.registration import EnvSpec; "
-        "print(gymnasium.make(EnvSpec.from_json(sys.stdin.read()), particles=30, substeps=1).unwrapped.torch_env)"
-    )
-    text = None
-    for program in (first, second):
-        command = [sys.executable, "-W", "ignore", "-c", program]
-        text = subprocess.run(command, cwd=tmp_path, input=text, capture_output=True, text=True, check=True).stdout
-    assert text == "TorchEnv('jump', 1, 8, device='cpu')\n"
-
-
-def test_names_namespaces_and_versions() -> None:
-    for version in (0, 1):
-        dittogym.register("hop", hop, version=version)
-    dittogym.register("hop", hop, namespace="mine", version=3)
-    ids = {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1", "mine/hop-coarse-v3", "mine/hop-fine-v3"}
-    assert ids <= set(gymnasium.registry)
-    assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
+def test_names_and_files_of_tasks() -> None:
+    dittogym.register("hop", hop)
     assert headline("hop") == headline("module:hop") == ("hop", "")
     assert headline("shapematch") == ("SHAPE MATCH", "Take the shape of a picture, without gravity.")
-    assert fingerprint("run") is None
-    assert fingerprint("hop") == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
 
 
 def test_the_later_registration_wins() -> None:
-    """As when a cell of a notebook is run twice; the names of the library's tasks stay theirs."""
+    """As when a cell of a notebook is run twice."""
     for horizon in (40, 20):
         dittogym.register("hop", lambda horizon=horizon: hop(horizon=horizon))
         assert gymnasium.spec("dittogym/hop-coarse-v0").max_episode_steps == horizon == tiny("hop").spec.horizon
-    with pytest.raises(ValueError, match="task must be a name that no task of the library has, got 'run'"):
-        dittogym.register("run", hop)
-    assert tiny("run").spec.name == "run"
-
-
-@pytest.mark.parametrize(
-    ("make", "options", "error", "argument"),
-    [
-        (5, {}, TypeError, "make"),
-        (hop(), {}, TypeError, "make"),
-        (lambda: None, {}, TypeError, "make must return a TaskSpec"),
-        (lambda pull, *, size, **rest: hop(), {}, TypeError, "make .* got none for pull, size$"),
-        (lambda particles=3, body=None: hop(), {}, ValueError, "make .* got body, particles$"),
-        (dittogym.TASKS["run"], {}, ValueError, "task must be the name in the specification"),
-        (hop, {"version": -1}, ValueError, "version"),
-        (hop, {"version": "1"}, ValueError, "version"),
-    ],
-)
-def test_what_cannot_be_registered(make: object, options: dict, error: type, argument: str) -> None:
-    with pytest.raises(error, match=argument):
-        dittogym.register("hop", make, **options)
-    assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
 
 
 def test_state_of_a_task_and_objects() -> None:
@@ -279,77 +231,6 @@ def test_a_goal_that_is_replaced_is_rewarded_and_marked(task: str) -> None:
     assert torch.equal(*images) is (spec.goal is None) and not torch.equal(*rewards)
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        (None, TypeError, "return a Reward, got NoneType"),
-        ({"terms": None}, TypeError, "terms by name"),
-        ({"info": [1]}, TypeError, "info by name"),
-        ({"task_state": torch.zeros(1)}, TypeError, "task_state by name"),
-        ({"terms": {"height": torch.zeros(3)}}, ValueError, r"terms of shape \(B,\) .* for 'height'"),
-        ({"terms": {"height": torch.zeros(2) * 1j}}, ValueError, "real numbers"),
-        ({"terms": {"alive": torch.zeros(2)}}, ValueError, r"own terms, got \['alive'\]"),
-        ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, ValueError, "terminated as bool"),
-        ({"success": torch.zeros(2)}, ValueError, "success as bool"),
-        ({"info": {"com": torch.zeros(2)}}, ValueError, r"own info, got \['com'\]"),
-        ({"info": {"_risen": torch.zeros(2)}}, ValueError, "got '_risen'"),
-        ({"info": {"risen": 1.0}}, ValueError, "for 'risen'"),
-        ({"task_state": {"best": torch.zeros(2)}}, ValueError, "like initial_task_state"),
-        ({"task_state": {"first": torch.zeros(2)}}, ValueError, "like initial_task_state"),
-    ],
-)
-def test_a_reward_function_is_tried_when_an_environment_is_made(
-    changes: dict | None, error: type, message: str
-) -> None:
-    def reward_fn(transition: Transition, spec: TaskSpec) -> Reward | None:
-        return None if changes is None else height(transition, spec)._replace(**changes)
-
-    functions = {"reward_fn": reward_fn, "initial_task_state": lambda transition, spec: {"first": transition.now.com}}
-    with pytest.raises(error, match=f"reward_fn of task 'hop' must .*{message}"):
-        tiny(changed(**functions), 1)
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"weights": {"heigth": 7.0}}, ValueError, r"weights of task 'hop' .* got none for \['height'\]"),
-        ({"weights": {"height": 7.0, "alve": 1.0}}, ValueError, r"weights of task 'hop' .* got \['alve'\]"),
-        ({"initial_task_state": lambda transition, spec: None}, TypeError, "initial_task_state of task 'hop'"),
-        ({"initial_task_state": lambda transition, spec: {"peak": 1.0}}, ValueError, "float for 'peak'"),
-        ({"split_limit": 0.05}, ValueError, "robot must be more compact"),
-        ({"robot": BodySpec(Rectangle((0.9, 0.2), (0.3, 0.1)), 100)}, ValueError, "robot must lie inside the window"),
-        ({"robot": BodySpec(Rectangle((0.05, 0.1), (0.1, 0.1)), 100)}, ValueError, "robot .* the obstacle 'floor'"),
-        ({"objects": (BodySpec(Disc((0.17, 0.02), 0.06), 100),)}, ValueError, r"objects\[0\] .* 'floor'"),
-        ({"objects": (BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)}, ValueError, r"objects\[0\] .* the window"),
-    ],
-)
-def test_a_task_that_cannot_start_is_refused(changes: dict, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        tiny(changed(**changes))
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"max_actuation": -5.0}, ValueError, "max_actuation"),
-        ({"goal": (1.0, 2.0, 3.0)}, ValueError, "goal"),
-        ({"patch_centre": (None, "up")}, ValueError, "patch_centre y"),
-        ({"patch_centre": (None, 5.0)}, ValueError, "patch_centre"),
-        ({"view": (-0.1, 0.5)}, ValueError, "view"),
-        ({"target": np.zeros((3, 3), bool)}, ValueError, "target"),
-        ({"weights": {"action": -2e-4}}, ValueError, r"weights\['action'\]"),
-        ({"weights": 1.0}, TypeError, "weights"),
-        ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\]"),
-        ({"obstacles": floor()}, TypeError, "obstacles"),
-        ({"coarse": 16}, ValueError, "coarse"),
-        ({"initial_task_state": "peak"}, TypeError, "initial_task_state must be a function"),
-    ],
-)
-def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        changed(**changes)
-
-
 def test_a_robot_of_another_material() -> None:
     """Constants that no body takes are refused; of those that the object alone takes there is a warning."""
     robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0), lite=100)
@@ -385,21 +266,6 @@ def test_an_environment_is_made_again_from_the_json_of_its_specification(task: s
     assert np.array_equal(env.reset(seed=0)[0], same.reset(seed=0)[0])
     same.unwrapped.load(env.unwrapped.save())  # fits
     gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
-
-
-def test_what_json_cannot_write_of_a_body_is_refused() -> None:
-    """A material that is learned, and a shape of one's own."""
-
-    @dataclasses.dataclass(frozen=True)
-    class Own(Disc):
-        tilt: float = 0.0
-
-    learned = BodySpec(Disc((0.1, 0.16), 0.15), 900, material=Elastic(torch.tensor(300.0), 50.0))
-    with pytest.raises(TypeError, match="Tensor"):
-        gymnasium.make("dittogym/run-coarse-v0", body=learned, **SMALL).spec.to_json()
-    spec = gymnasium.make("dittogym/run-coarse-v0", body=Own((0.1, 0.16), 0.15), **SMALL).spec
-    with pytest.raises(ValueError, match="kind of a body"):
-        gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(spec.to_json()))
 
 
 def test_centres_may_be_lists_and_a_fixed_window_may_lie_anywhere() -> None:

@@ -41,8 +41,6 @@ def test_muscles_target_and_size() -> None:
     assert len(red) > 1000
     with pytest.raises(IndexError, match="index"):
         env.render(2)
-    with pytest.raises(ValueError, match="size"):
-        env.render(size=3)
 
 
 def test_a_shot_holds_the_quantities_that_are_asked_for() -> None:

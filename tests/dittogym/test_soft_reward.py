@@ -152,11 +152,6 @@ def test_soft_limits() -> None:
     assert (zero - (z / 50.0).clamp(0.0, 1.0)).abs().max().item() == pytest.approx(0.05 * math.log(2))
     relu = SMOOTH.clamp(z, 0.0, width=2.0)
     assert (relu - z.clamp_min(0.0)).abs().max().item() == pytest.approx(2.0 * math.log(2))
-    for ops in (EXACT, SMOOTH):  # so that an exact step finds what a smooth one cannot do
-        with pytest.raises(ValueError, match="width"):
-            ops.clamp(z, 0.0)
-    with pytest.raises(ValueError, match="width"):
-        SMOOTH.clamp(z, 0.0, width=0)
     assert EXACT.heaviside(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
     near = SMOOTH.heaviside(torch.tensor([-0.4, 0.0, 0.4]), 0.1).tolist()
     assert near == pytest.approx([0.018, 0.5, 0.982], abs=1e-3)
@@ -187,6 +182,3 @@ def test_distances_of_particles_and_of_averages() -> None:
     torch.testing.assert_close(distance(x, point), expected)
     torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])
     torch.testing.assert_close(distance(x, point[0])[0], expected[0])
-    for wrong in (1.0, (0.0, 0.0, 9.0)):
-        with pytest.raises(ValueError, match="point"):
-            distance(torch.zeros(1, 2), wrong)

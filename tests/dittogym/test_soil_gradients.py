@@ -43,7 +43,7 @@ def starts(env: TorchEnv) -> list[tuple[EnvState, Tensor]]:
     draw, found = torch.Generator().manual_seed(3), []
     env.reset(seed=0)
     noise = torch.zeros(1, 2, 4, 4)
-    for _ in range(8):
+    for _ in range(4):
         actions = []
         for _ in range(STEPS):
             noise = 0.9 * noise + math.sqrt(1 - 0.9**2) * torch.randn(noise.shape, generator=draw)
@@ -71,5 +71,5 @@ def test_gradients_are_bounded_and_lead_upwards() -> None:
         with torch.no_grad():
             ahead = (actions + 0.2 * found / norms[:, None, None, None, None]).clamp(-1, 1)
             improved += bool(returns(env, state, ahead) > returns(env, state, actions))
-    assert improved >= 6
-    assert huge >= 4
+    assert improved >= 3
+    assert huge >= 2

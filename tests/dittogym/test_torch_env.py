@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import actions, forget, tiny
+from tiny import actions, assert_same_bits, everything, forget, tiny
 from torch.utils.checkpoint import checkpoint
 
 import dittogym
@@ -49,9 +49,6 @@ def test_a_seed_for_each_element() -> None:
     env.reset(seed=[7, 5, 6])
     env.reset(seed=(0, 0, 7), options={"reset_mask": torch.tensor([False, False, True])})
     assert torch.equal(env.state.x, counted.state.x[[2, 0, 2]])
-    for wrong in ([1, 2], [1, -2, 3], np.array([1, 2]), np.array([1.0, 2.0, 3.0]), np.array(3)):
-        with pytest.raises(ValueError, match="seed"):
-            env.reset(seed=wrong)
 
 
 def test_a_reset_shows_the_new_episode() -> None:
@@ -72,24 +69,6 @@ def test_positions_option() -> None:
     assert info["com"][0].tolist() == pytest.approx([0.5, 0.3])
     env.step(torch.zeros(2, *env.action_shape))
     assert torch.equal(env.reset()[0], observation)
-
-
-@pytest.mark.parametrize(
-    "positions",
-    [
-        np.zeros((299, 2)),
-        np.full((300, 2), np.nan),
-        np.linspace((0.0, 0.5), (2.0, 0.5), 300),  # outside the window
-        np.linspace((0.4, -0.5), (0.5, 0.5), 300),
-    ],
-)
-def test_bad_positions(positions: np.ndarray) -> None:
-    env = small()
-    env.reset(seed=0)
-    before = env.state
-    with pytest.raises(ValueError, match="positions must"):
-        env.reset(options={"positions": positions})
-    assert env.state is before
 
 
 def test_layouts_of_arrays_do_not_matter() -> None:
@@ -135,35 +114,23 @@ def float64() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(
-    "action",
-    [
-        torch.zeros(1, 2, 8, 7),
-        torch.full((1, 2, 8, 8), torch.nan),
-        torch.zeros(1, 2, 8, 8, dtype=torch.int64),
-        torch.zeros(1, 2, 8, 8).to_sparse(),
-        np.zeros((1, 2, 8, 8)),
-    ],
-)
-def test_bad_actions(action: object) -> None:
-    env = small()
-    env.reset(seed=0)
-    before = env.state
-    with pytest.raises(ValueError, match="action must"):
-        env.step(action)
-    assert env.state is before
-
-
-def test_bad_resets() -> None:
+def test_bad_input_changes_nothing() -> None:
+    """Neither of this episode nor of the next."""
     env = small(num_envs=2)
-    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
-        env.step(torch.zeros(2, 2, 8, 8))
-    with pytest.raises(ValueError, match="first time"):
-        env.reset(options={"reset_mask": [True, False]})
-    with pytest.raises(ValueError, match="reset_mask"):
-        env.reset(options={"reset_mask": [1, 0]})
-    with pytest.raises(ValueError, match=r"options may hold .* got 'position'"):
-        env.reset(options={"position": 0})
+    env.reset(seed=0, options={"physics": {"mu": 300.0}})
+    before, numbers = env.state, [t.clone() for t in everything(env)]
+    for options in ({"positions": np.zeros((299, 2))}, {"physics": {"mu": -1.0}}, {"physics": {"mu": 9e9}}):
+        with pytest.raises(ValueError, match="must"):
+            env.reset(seed=5, options=options)
+    with pytest.raises(ValueError, match="action must"):
+        env.step(torch.full((2, 2, 8, 8), torch.nan))
+    other = small("grow", 2)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="snapshot must"):
+        env.load(other.save(), [True, False])
+    assert env.state is before
+    env.reset()
+    assert_same_bits(everything(env), numbers)
 
 
 @pytest.mark.parametrize("backend", ["auto", "eager"])
@@ -197,11 +164,6 @@ def test_detach_cuts_the_graph() -> None:
     env.detach()
     env.step(second)[1].sum().backward()
     assert first.grad is None and second.grad is not None
-    mu = torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
-    env.reset(seed=0, options={"physics": {"mu": mu}})
-    for _ in range(2):
-        assert torch.autograd.grad(env.step(first)[1].sum(), mu)[0] != 0
-        env.detach(physics=False)  # but for a constant that is learned from one stretch after the other
 
 
 @pytest.mark.parametrize("use_reentrant", [True, False])
@@ -268,8 +230,6 @@ def test_random_generators_can_be_put_back() -> None:
     env.generators = before
     env.reset()
     assert torch.equal(env.state.x, places)
-    with pytest.raises(RuntimeError, match=r"call reset\(\) first: elements \[0, 1\] have no random generator yet"):
-        tiny("run", 2, resample=True).generators = before
 
 
 @torch.no_grad()

@@ -79,20 +79,6 @@ def test_a_graph_is_neither_pickled_nor_copied_without_a_word() -> None:
     assert not any(leaf.requires_grad for leaf in tree.leaves(pickle.loads(pickle.dumps(env)).env_state))
 
 
-def test_bad_arguments_of_the_pure_functions_are_named() -> None:
-    env = tiny("run", 2)
-    env.reset(seed=0)
-    x, action = env.state.x, torch.zeros(2, *env.action_shape, dtype=env.dtype)
-    for positions in (x[:, 1:], x[0], x[..., :1], x.tolist()):
-        with pytest.raises(ValueError, match="positions"):
-            core.reset(env.model, positions)
-    with pytest.raises(ValueError, match="physics"):
-        core.reset(env.model, x, {"young": torch.ones(2)})
-    for wrong in (action[0], action[:1], action.float(), action[:, :1], torch.zeros(2, 2, 65, 65, dtype=env.dtype)):
-        with pytest.raises(ValueError, match="action"):
-            core.step(env.model, env.env_state, wrong)
-
-
 def test_the_reward_has_second_derivatives_at_rest() -> None:
     env = tiny("run", backend="eager", particles=50, substeps=2)
     env.reset(seed=0)

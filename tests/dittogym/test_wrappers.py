@@ -12,7 +12,6 @@ from gymnasium import wrappers
 from tiny import SMALL, make_vec
 from torch.nn.functional import interpolate
 
-import dittogym
 from dittogym.wrappers import action_resolution, observation_resolution
 
 NAME = "dittogym/run-coarse-v0"
@@ -172,15 +171,3 @@ def test_observations_of_environments_that_reset_in_the_same_step() -> None:
     assert reduced[3].all() and small.observation_space.contains(reduced[0])
     for large, little in zip(whole[4]["final_obs"], reduced[4]["final_obs"], strict=True):
         assert np.array_equal(cv2.resize(large[0], (16, 16), interpolation=cv2.INTER_AREA), little[0])
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    env = action_resolution(single(), 4)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action"):
-        env.step(np.zeros((2, 5, 5), np.float32))
-    with pytest.raises(TypeError, match="env"):
-        action_resolution(dittogym.TorchEnv("run", **SMALL), 4)
-    for size in (0, -1, 65):
-        with pytest.raises(ValueError, match="size"):
-            observation_resolution(batch(), size)

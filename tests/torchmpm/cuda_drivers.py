@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from cuda_imitation import THREADS, Gpu
+from cuda_imitation import Gpu
 
 from torchmpm.native import kernels
 from torchmpm.native.cuda import plan
@@ -51,7 +51,7 @@ class Recorder:
 class Imitation(Gpu):
     """The imitation of a GPU, with few libraries: one serves all materials and all numbers of particles."""
 
-    def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, bool]:
+    def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, Kernel]:
         return super().load(kernel._replace(kinds=7, per_thread=max(kernel.per_thread, plan.PER_THREAD)), device)
 
 
@@ -61,8 +61,8 @@ def in_use(driver: Driver) -> Iterator[Any]:
     launcher = Launcher(driver)
     with pytest.MonkeyPatch.context() as patch:
         if isinstance(driver, Imitation):
-            patch.setattr(plan, "SHARED_THREADS", THREADS)
-            patch.setattr(plan, "TEAM_THREADS", THREADS)
+            patch.setattr(plan, "SHARED_THREADS", 32)
+            patch.setattr(plan, "TEAM_THREADS", 32)
         patch.setattr(kernels, "forward", launcher.forward)
         patch.setattr(kernels, "backward", launcher.backward)
         yield driver

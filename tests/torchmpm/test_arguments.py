@@ -73,7 +73,6 @@ VALUES = {
     "count": [
         *(lambda n=n: body(count=n) for n in (2.5, 0)),
         *(lambda n=n: sampling.sobol(n, 0) for n in (2**40, 0, -3)),
-        *(lambda n=n: sampling.uniform(n, np.random.default_rng(0)) for n in (0, -3)),
     ],
     "mass": [
         *(lambda m=m: body(mass=m) for m in ([1.0], torch.ones(0), 0.0)),
@@ -162,7 +161,6 @@ TYPES = {
     "x": [lambda x=x: ParticleState.at_rest(x) for x in (np.zeros((5, 2)), torch.zeros(1, 5, 2).to_sparse())],
     "actuation": [lambda: step(lively(5), FIELD.to_sparse())],
     "origin": [lambda: step(origin=[0.0, 0.0])],
-    "generator": [lambda: sampling.uniform(3, None)],
     "stress of Averaged": [lambda: solver(bodies=(body(material=Averaged(300.0, 80.0)),)).step(lively(5, 2))],
     "return_map of Alone": [lambda: solver(bodies=(body(material=Alone(300.0, 80.0)),)).step(lively(5, 2))],
 }

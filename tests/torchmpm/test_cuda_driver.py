@@ -19,7 +19,8 @@ from scenes import lively, normal, robot, robot_and_ball
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchmpm import Grid, Solver
+from torchmpm import Grid, ParticleState, Solver, backends
+from torchmpm.native import kernels
 from torchmpm.native.cuda import compiler, launcher, plan
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
@@ -148,8 +149,8 @@ def test_arguments_are_those_of_the_call() -> None:
             super().launch(function, launch, arguments, device)
             bodies = (BodyTable * arguments.num_bodies).from_address(arguments.bodies)
             rules = (RuleTable * arguments.num_rules).from_address(arguments.rules)
-            counters = ctypes.c_int32 * (launch.blocks // arguments.team * COUNTERS)
-            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters))))
+            counters = ctypes.c_int32 * (launch.cooperative * launch.blocks // arguments.team * COUNTERS)
+            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters or 1))))
 
     with in_use(Reader()) as driver, torch.no_grad():
         solver.step(state, field, substeps=7, origin=origin)
@@ -323,7 +324,9 @@ def test_kernels_compile(adjoint: bool, shared: bool) -> None:
 def test_an_old_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiler, "missing", lambda cuda: None)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    compiler.unavailable.cache_clear()
     reason = compiler.unavailable(torch.device("cuda", 0))
+    compiler.unavailable.cache_clear()
     assert reason == "on CUDA it needs a card of compute capability 8.0 or newer, cuda:0 has 7.5"
 
 
@@ -348,3 +351,27 @@ class Zeros(Recorder):
     def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
         if arguments.result:
             ctypes.memset(arguments.result, 0, 4 * 13 * arguments.batch * arguments.particles)
+
+
+@pytest.mark.parametrize("reason", [None, "x differed"])
+def test_auto_on_a_gpu_follows_the_check(
+    reason: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And says why it is eager; whoever asks for the kernels gets them without it."""
+    asked: list[tuple[torch.device, torch.dtype]] = []
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: None)
+    monkeypatch.setattr("torchmpm.solver.kernels_fail", lambda *of: asked.append(of) or reason)
+    backends.warn_eager.cache_clear()
+    state, solver = lively(5), robot(5, backend="auto")
+    assert replace(solver, backend="native").runs_native(state) and not asked
+    assert solver.runs_native(state) == (reason is None) and asked == [(torch.device("cuda", 0), torch.float64)]
+    said = [record.message for record in caplog.records if record.name == "torchmpm.backends"]
+    assert not said if reason is None else "operator by operator" in said[0] and reason in said[0]
+
+
+def test_an_unavailable_gpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: "on CUDA it needs cuda-core")
+    with pytest.raises(ValueError, match="backend 'native' cannot run this: on CUDA it needs cuda-core; use 'eager'"):
+        robot(5, backend="native").runs_native(lively(5))

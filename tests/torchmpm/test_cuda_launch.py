@@ -1,4 +1,7 @@
-"""The whole way of a step through the CUDA kernels: on an imitation of a GPU, and on a GPU where there is one."""
+"""The whole way of a step through the CUDA kernels on a GPU; without one, the main things on an imitation of it.
+
+What the kernels do there under all plans of a launch is tested in test_cuda_imitation.py.
+"""
 
 import gc
 import math
@@ -29,9 +32,11 @@ from torchmpm.solver import kernels_fail
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 COUNT = 45
+ON_A_GPU = pytest.param("cuda", marks=pytest.mark.cuda)
+on_a_gpu = pytest.mark.parametrize("device", [ON_A_GPU], indirect=True)
 
 
-@pytest.fixture(params=["imitation", pytest.param("cuda", marks=pytest.mark.cuda)], autouse=True)
+@pytest.fixture(params=["imitation", ON_A_GPU], autouse=True)
 def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """Where the tensors are; meanwhile the native backend runs the CUDA kernels."""
     if request.param == "cuda":
@@ -77,12 +82,14 @@ def test_single_precision(name: str, device: str) -> None:
     assert_close(single.to("cpu", torch.float64), exact, 1e-4)
 
 
+@on_a_gpu
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 128, 129, 300])
 def test_sizes(count: int, device: str) -> None:
     """Around those of a block and of a team of blocks."""
     assert_close(*both(robot(count), device, lively(count, 2), 40.0 * normal(2, 2, 16, 16, seed=1), substeps=2), 1e-9)
 
 
+@on_a_gpu
 @pytest.mark.parametrize("count", [0, 1, 3, len(RULES)])
 def test_rules(count: int, device: str) -> None:
     """From none to all directions, overlapping, with and without friction, in the world's and the window's frame."""
@@ -102,24 +109,28 @@ def test_gradients_in_values(batch: int, device: str) -> None:
     both_gradients(lambda leaves: varied(COUNT, leaves), device, given, tuple(value_leaves(3, 1)), 4)
 
 
+@on_a_gpu
 @pytest.mark.parametrize("wanted", ["actuation", "mu", "gravity", "x", "origin"])
 def test_gradient_in_one_thing_alone(wanted: str, device: str) -> None:
     given = state_leaves(30, 2) | value_leaves(30, 2)
     both_gradients(lambda leaves: varied(30, leaves), device, given, (wanted,), 1)
 
 
+@on_a_gpu
 @pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Snow(800.0, 500.0)])
 def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic, device: str) -> None:
     solver = robot(12, bodies=(Body(12, material, muscle=True),))
     both_gradients(lambda _: solver, device, corner_leaves(), STATE, 1)
 
 
+@on_a_gpu
 def test_limited_gradients_of_soil(device: str) -> None:
     """Hardened soil and spinning grains, see test_resolved.py."""
     given = hardened(batch=2)
     both_gradients(lambda _: hard_soil(), device, given, tuple(given), 3)
 
 
+@on_a_gpu
 def test_gradients_of_soil_in_single_precision_are_finite(device: str) -> None:
     """Strains whose squares are smaller than the smallest normal number have derivatives like others."""
     leaves = {name: value.float().to(device) for name, value in state_leaves(30, 1).items()}
@@ -130,6 +141,7 @@ def test_gradients_of_soil_in_single_precision_are_finite(device: str) -> None:
     assert all(value.isfinite().all() for value in found.values())
 
 
+@on_a_gpu
 def test_muscles_without_actuation_and_actuation_without_muscles(device: str) -> None:
     assert_close(*both(robot(20), device, lively(20), substeps=2), 1e-9)
     passive = robot(20, bodies=(Body(20, VonMises(500.0, 50.0, 60.0)),))
@@ -139,12 +151,14 @@ def test_muscles_without_actuation_and_actuation_without_muscles(device: str) ->
     assert not zero["actuation"].any()
 
 
+@on_a_gpu
 def test_window_of_another_size_and_spacing(device: str) -> None:
     solver = robot(20, grid=Grid(33, spacing=0.05, margin=0.01), rules=(VelocityRule("-y", j=(None, 10)),))
     state = lively(20, corner=(0.9, 0.4))
     assert_close(*both(solver, device, state, normal(1, 2, 33, 33, seed=1), substeps=3), 1e-9)
 
 
+@on_a_gpu
 @pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float, device: str) -> None:
     """Above and below the window, and at no place, particles keep what they have."""
@@ -157,6 +171,7 @@ def test_positions_no_address_exists_for(y: float, device: str) -> None:
     assert torch.equal(native.v[:, 3].cpu(), state.v[:, 3])
 
 
+@on_a_gpu
 @pytest.mark.parametrize("name", ["x", "F", "actuation"])
 @pytest.mark.parametrize("value", [float("nan"), 1e30])
 def test_a_broken_element_harms_no_other(name: str, value: float, device: str) -> None:
@@ -201,15 +216,15 @@ def test_the_check_of_a_device_passes(dtype: torch.dtype, device: str) -> None:
     kernels_fail.cache_clear()
 
 
-@pytest.mark.cuda
-def test_auto_is_native_on_a_gpu() -> None:
+@on_a_gpu
+def test_auto_is_native_on_a_gpu(device: str) -> None:
     solver, state = robot(30, backend="auto"), lively(30).to("cuda")
     assert solver.runs_native(state)
     assert_identical(solver.step(state, substeps=3), replace(solver, backend="native").step(state, substeps=3))
 
 
-@pytest.mark.cuda
-def test_on_another_stream() -> None:
+@on_a_gpu
+def test_on_another_stream(device: str) -> None:
     """It waits for what that stream computes, and for nothing else."""
     solver, state = robot(300, backend="native"), lively(300, 4).to("cuda")
     expected, stream = solver.step(state, substeps=50), torch.cuda.Stream()
@@ -222,8 +237,8 @@ def test_on_another_stream() -> None:
     assert_identical(found, expected)
 
 
-@pytest.mark.cuda
-def test_within_a_graph_of_the_caller() -> None:
+@on_a_gpu
+def test_within_a_graph_of_the_caller(device: str) -> None:
     """A step waits for nothing and copies nothing, so that a CUDA graph can hold it."""
     solver, state = robot(100, backend="native"), lively(100).to("cuda")
     with torch.no_grad():
@@ -235,8 +250,8 @@ def test_within_a_graph_of_the_caller() -> None:
     assert_identical(found, expected)
 
 
-@pytest.mark.cuda
-def test_memory_is_given_back() -> None:
+@on_a_gpu
+def test_memory_is_given_back(device: str) -> None:
     solver, state = robot(300, backend="native"), lively(300, 4).to("cuda")
     x = state.x.clone().requires_grad_()
     for _ in range(2):

@@ -198,6 +198,17 @@ def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_gradients_close(cut, whole, 1e-14)
 
 
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's own: it takes row by row
+def test_a_whole_jacobian_at_once() -> None:
+    solver, state = robot(10, backend="native"), lively(10)
+
+    def centre(v: Tensor) -> Tensor:
+        return solver.step(replace(state, v=v), substeps=2).x.mean(1)[0]
+
+    rows, whole = (torch.autograd.functional.jacobian(centre, state.v, vectorize=v) for v in (False, True))
+    assert torch.equal(rows, whole) and whole.abs().max() > 0
+
+
 def test_second_derivatives_are_refused() -> None:
     v = lively(10).v.clone().requires_grad_()
     final = robot(10, backend="native").step(replace(lively(10), v=v), substeps=2)

@@ -138,27 +138,36 @@ class Step(torch.autograd.Function):
     def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives in the tensors of :class:`Inputs` from that in the new components."""
         tensors, (_, wants_field, _, _, wants_values) = ctx.saved_tensors, ctx.needs_input_grad[2:7]
-        found = Adjoint.apply(ctx.tables, ctx.substeps, wants_field, wants_values, *tensors, result_bar)
+        tables = ctypes.addressof(ctx.tables)
+        found = adjoint(*tensors, result_bar, tables, ctx.substeps, wants_field, wants_values)
         *bars, values_bar = (bar if bar.numel() else None for bar in found)
         if values_bar is not None:
             values_bar = _sum_shared(values_bar, tensors[4], ctx.tables)
         return None, None, *bars, values_bar, None
 
 
-class Adjoint(torch.autograd.Function):
-    """The derivative of :class:`Step`, which has none of its own."""
+# An operator, so that torch can take it row by row where a whole Jacobian is asked for (``is_grads_batched=True``).
+@torch.library.custom_op(
+    "torchmpm::adjoint",
+    mutates_args=(),
+    schema=(
+        "(Tensor components, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift, "
+        "Tensor result_bar, int tables, int substeps, bool wants_field, bool wants_values) "
+        "-> (Tensor, Tensor, Tensor, Tensor, Tensor)"
+    ),
+)
+def adjoint(*arguments: Any) -> tuple[Tensor, ...]:
+    """The derivative of :class:`Step`, from :class:`Inputs` and the address of :class:`Tables`."""
+    *tensors, tables, substeps, wants_field, wants_values = arguments
+    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+    return backward(inputs, Tables.from_address(tables), substeps, wants_field, wants_values)
 
-    @staticmethod
-    def forward(
-        ctx: Any, tables: Tables, substeps: int, wants_field: bool, wants_values: bool, *tensors: Any
-    ) -> tuple[Tensor, ...]:
-        """Derivatives as :meth:`Inputs.empty_cotangents` lists them."""
-        return backward(tree.map(Tensor.contiguous, Inputs(*tensors)), tables, substeps, wants_field, wants_values)
 
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> Any:
-        """Refused: only the plain operations have second derivatives."""
-        raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
+def _no_second_derivative(ctx: Any, *_: Tensor) -> None:
+    raise RuntimeError("backend 'native' has no second derivatives: use backend 'eager'")
+
+
+adjoint.register_autograd(_no_second_derivative)
 
 
 def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:

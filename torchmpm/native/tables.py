@@ -84,13 +84,13 @@ class Inputs(NamedTuple):
 
         The last has the shape (8, B, N), a column for each particle. Those that are not wanted are empty.
         """
-        nothing = self.components.new_empty(0)
+        components, field = self.components, self.field
         return (
-            torch.empty_like(self.components),
-            torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
+            torch.empty_like(components),
+            components.new_empty(field.shape if wants_field and field is not None else 0),
             torch.empty_like(self.origin),
             torch.empty_like(self.gravity),
-            self.components.new_empty(VALUES, *self.components.shape[1:]) if wants_values else nothing,
+            components.new_empty((VALUES, *components.shape[1:]) if wants_values else 0),
         )
 
 
@@ -130,9 +130,8 @@ def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
 
 @cached_tensors
 def upload(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers as a tensor; does not wait for the device."""
-    host = torch.tensor(numbers, dtype=dtype, device="cpu")
-    return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
+    """Numbers as a tensor, which is kept; steps on any stream of the device may use it."""
+    return torch.tensor(numbers, dtype=dtype, device=device)
 
 
 def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Tensor:

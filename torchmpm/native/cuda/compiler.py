@@ -28,6 +28,7 @@ _logger = logging.getLogger(__name__)
 _lock = threading.Lock()
 
 
+@functools.cache
 def unavailable(device: torch.device) -> str | None:
     """Why the kernels cannot run on a CUDA device, or ``None``."""
     reason = missing(torch.version.cuda)

@@ -4,7 +4,7 @@ import ctypes
 import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 
@@ -28,6 +28,7 @@ class Launch(NamedTuple):
     cooperative: bool = False  # all blocks are resident at once, so that they can wait for each other
 
 
+@runtime_checkable
 class Driver(Protocol):
     """A GPU, or what stands for one."""
 

@@ -72,7 +72,8 @@ class Launcher:
         }
         for one, function in plan:
             scratch, teams = _scratch(one, device)
-            counters = torch.zeros(teams * COUNTERS, dtype=torch.int32, device=device)
+            meetings = 0 if one.kernel.shared else teams * COUNTERS  # blocks that share no robot do not meet
+            counters = torch.zeros(meetings, dtype=torch.int32, device=device)
             arguments = Arguments(
                 **common,
                 rows=one.rows,
@@ -116,10 +117,9 @@ def _contents(tables: Tables) -> tuple[bytes, bytes]:
 
 @functools.lru_cache(maxsize=256)
 def _upload(content: bytes, device: torch.device) -> Tensor:
-    """Bytes on a device; kept, so that a step copies nothing there."""
+    """Bytes on a device; kept, so that a step copies nothing there. Other streams need not wait for the copy."""
     with torch.inference_mode(False):
-        host = torch.tensor(list(content), dtype=torch.uint8, device="cpu")
-        return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
+        return torch.tensor(list(content), dtype=torch.uint8, device=device)
 
 
 #: Launches on GPUs.
