@@ -63,8 +63,8 @@ class Gpu:
         scratch = ctypes.create_string_buffer(b"\xcb" * (size + MARGIN), size + MARGIN)
         arguments.scratch = ctypes.addressof(scratch)
         if arguments.result and (kernel.shared or not arguments.status):
-            size = COMPONENTS * arguments.batch * arguments.particles * kernel.real_bytes
-            ctypes.memset(arguments.result, 0xFF, size)  # NaN where nothing is written
+            numbers = COMPONENTS * arguments.batch * arguments.particles
+            ctypes.memset(arguments.result, 0xFF, numbers * kernel.real_bytes)  # NaN where nothing is written
         outcome = kernels.launch(
             ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
             ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
