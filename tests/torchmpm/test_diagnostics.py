@@ -91,7 +91,6 @@ def test_impulse_of_a_floor(state: ParticleState) -> None:
         assert (found[:, 0].abs() > 1.0).tolist() == [share[0] == 1.0] * 2
 
 
-
 def test_impulses_take_actuation_and_origin(state: ParticleState) -> None:
     field = 60.0 * normal(2, 2, 16, 16, seed=1)
     origin = torch.tensor([[0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)
