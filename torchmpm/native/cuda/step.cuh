@@ -1,4 +1,4 @@
-// All substeps of a step, for particles that a thread keeps in registers (forward) or streams from a tape (adjoint).
+// All substeps of a step, for the particles of the forward kernel or those that the adjoint streams from its tape.
 #pragma once
 #include "substep.cuh"
 
