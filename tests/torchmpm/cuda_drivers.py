@@ -52,7 +52,7 @@ class Imitation(Gpu):
     """The imitation of a GPU, with few libraries: one serves all materials and all numbers of particles."""
 
     def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, Kernel]:
-        return super().load(kernel._replace(kinds=7, per_thread=max(kernel.per_thread, plan.PER_THREAD)), device)
+        return super().load(kernel._replace(kinds=7, per_thread=kernel.per_thread and plan.PER_THREAD), device)
 
 
 @contextmanager
@@ -62,6 +62,7 @@ def in_use(driver: Driver) -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
         if isinstance(driver, Imitation):
             patch.setattr(plan, "SHARED_THREADS", 32)
+            patch.setattr(plan, "ADJOINT_THREADS", 32)
             patch.setattr(plan, "TEAM_THREADS", 32)
         patch.setattr(kernels, "forward", launcher.forward)
         patch.setattr(kernels, "backward", launcher.backward)

@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchmpm import Grid, ParticleState, Solver, backends
 from torchmpm.native import kernels
-from torchmpm.native.cuda import compiler, launcher, plan
+from torchmpm.native.cuda import compiler, launcher
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.tables import BodyTable, RuleTable
@@ -73,26 +73,33 @@ def test_a_large_robot_takes_one_cooperative_launch() -> None:
     assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
 
 
-@pytest.mark.parametrize("batch", [1, 5])
+@pytest.mark.parametrize("batch", [1, 2])
 def test_a_robot_larger_than_the_card_has_threads(batch: int) -> None:
-    """They keep more particles each, so that all blocks of a team are resident."""
-    (one,) = launches(window(22_000), batch, card=Card(4, 101_376))
-    assert one.launch.blocks == one.arguments.team <= 4
-    assert one.arguments.team * one.kernel.threads * one.kernel.per_thread >= 22_000
+    """They keep their particles in memory, so that all blocks of a team are resident."""
+    (one,) = launches(window(22_000), batch, card=Card(20, 101_376))
+    assert one.launch.blocks == one.arguments.team == 20 and one.kernel.per_thread == 0
 
 
-def test_two_bodies_take_teams() -> None:
-    (one,) = launches(replace(robot_and_ball(60, 30), backend="native"), 3)
-    assert one.launch.cooperative and (one.arguments.num_bodies, one.launch.blocks) == (2, 3)
+def test_many_large_robots_take_a_block_each() -> None:
+    """Which keeps their particles in memory."""
+    first, second = launches(window(22_000), 64)
+    assert first.kernel.shared and first.kernel.per_thread == 0 and first.launch.blocks == 64
+    assert second.launch.cooperative and second.arguments.status == first.arguments.status != 0
 
 
-def test_double_precision_takes_a_block_where_its_nodes_fit() -> None:
-    on_h100 = launches(window(2000), dtype=torch.float64)
-    assert [one.kernel.shared for one in on_h100] == [True, False]
-    assert on_h100[0].arguments.rows >= plan.SMALLEST_WINDOW
-    assert [one.kernel.shared for one in launches(window(2000), dtype=torch.float64, card=RTX_4090)] == [False]
-    on_4090 = launches(window(2000), card=RTX_4090)
-    assert on_4090[0].kernel.shared and on_4090[0].launch.shared_bytes <= RTX_4090.shared_bytes
+def test_two_bodies_take_one_window() -> None:
+    first, second = launches(replace(robot_and_ball(60, 30), backend="native"), 3)
+    assert first.kernel.shared and (first.arguments.num_bodies, first.launch.blocks) == (2, 3)
+    assert second.launch.cooperative and second.launch.blocks == 3
+
+
+@pytest.mark.parametrize("card", [H100, RTX_4090])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_windows_are_as_large_as_the_memory_of_a_block(card: Card, dtype: torch.dtype) -> None:
+    first, second = launches(window(2000), dtype=dtype, card=card)
+    side, node = first.arguments.rows, first.kernel.node_bytes
+    assert first.kernel.shared and not second.kernel.shared and first.arguments.columns == side
+    assert first.launch.shared_bytes <= card.shared_bytes < first.launch.shared_bytes + 2 * (side + 1) * node
 
 
 def test_a_card_that_cannot_run_a_block() -> None:

@@ -7,12 +7,16 @@ from torchmpm.grid import PAD
 from torchmpm.native.cuda.arguments import Kernel
 from torchmpm.native.cuda.driver import Card
 
-#: Threads of a block with the nodes of a robot in shared memory, and of the blocks that share a robot.
-SHARED_THREADS, TEAM_THREADS = 512, 256
+#: Threads of a block with the nodes of a robot in shared memory, forward and in the adjoint, and of the blocks that
+#: share a robot. More of them would spill registers, in double precision more than half as many.
+SHARED_THREADS, ADJOINT_THREADS, TEAM_THREADS = 512, 384, 256
 #: Particles that a thread keeps in registers without spilling them.
 PER_THREAD = 4
-#: Sides of windows in shared memory: a robot of the tasks needs more than the smaller, and none the larger.
-SMALLEST_WINDOW, LARGEST_WINDOW = 48, 64
+#: Side of a window in shared memory below which no robot would fit.
+SMALLEST_WINDOW = 16
+#: A robot of more particles than a block keeps in registers takes several blocks, unless there is one robot for every
+#: so many multiprocessors: then a block for each is faster, as it adds in shared memory.
+FEW = 8
 
 
 class Call(NamedTuple):
@@ -62,15 +66,17 @@ def passes(call: Call, card: Card, resident: Resident) -> list[Pass]:
 
 
 def shared_pass(call: Call, card: Card, resident: Resident) -> Pass | None:
-    """One block for each robot, with its nodes in shared memory; ``None`` for those that do not fit there.
+    """One block for each robot, with its nodes in shared memory; ``None`` where several blocks are faster.
 
-    Two bodies can be far apart, and a window that follows both would be as large as the whole grid.
+    The window is as large as the memory allows: two bodies may be far apart. Robots that do not fit are given up before
+    their first substep.
     """
-    per_thread = -(-call.particles // SHARED_THREADS)
-    if call.bodies > 1 or per_thread > PER_THREAD:
+    if call.particles > PER_THREAD * SHARED_THREADS and FEW * call.batch < card.multiprocessors:
         return None
-    kernel = _kernel(call, shared=True, threads=SHARED_THREADS, per_thread=per_thread)
-    for side in range(min(call.width, LARGEST_WINDOW), min(call.width, SMALLEST_WINDOW) - 1, -1):
+    threads = (ADJOINT_THREADS if call.adjoint else SHARED_THREADS) // (2 if call.real == "double" else 1)
+    per_thread = -(-call.particles // threads)
+    kernel = _kernel(call, shared=True, threads=threads, per_thread=per_thread if per_thread <= PER_THREAD else 0)
+    for side in range(call.width, min(call.width, SMALLEST_WINDOW) - 1, -1):
         size = kernel.shared_bytes(side, side, call.bodies, call.rules)
         if size <= card.shared_bytes:
             scratch = kernel.scratch_bytes(side, side, call.resolution, call.particles, call.substeps)
@@ -86,14 +92,13 @@ def team_pass(call: Call, card: Card, resident: Resident) -> Pass:
     """
     few = call.batch * -(-call.particles // TEAM_THREADS) <= card.multiprocessors
     per_thread = 1 if few else PER_THREAD
-    while True:
-        team = -(-call.particles // (TEAM_THREADS * per_thread))
-        kernel = _kernel(call, shared=False, threads=TEAM_THREADS, per_thread=per_thread)
-        size = kernel.shared_bytes(call.width, call.width, call.bodies, call.rules)
-        blocks = _at_least_one(kernel, resident(kernel, size))
-        if team <= blocks:
-            break
-        per_thread *= 2  # beyond the registers, but it runs
+    team = -(-call.particles // (TEAM_THREADS * per_thread))
+    kernel = _kernel(call, shared=False, threads=TEAM_THREADS, per_thread=per_thread)
+    size = kernel.shared_bytes(call.width, call.width, call.bodies, call.rules)
+    blocks = _at_least_one(kernel, resident(kernel, size))
+    if team > blocks:  # the blocks that are resident take all, and keep them in memory
+        kernel = _kernel(call, shared=False, threads=TEAM_THREADS, per_thread=0)
+        team = blocks = min(blocks, _at_least_one(kernel, resident(kernel, size)))
     scratch = kernel.scratch_bytes(call.width, call.width, call.resolution, call.particles, call.substeps)
     return Pass(kernel, call.width, call.width, team, min(call.batch, blocks // team), size, scratch)
 
