@@ -67,6 +67,7 @@ def in_use(driver: Driver) -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
         if isinstance(driver, Imitation):
             patch.setattr(plan, "SHARED_THREADS", 32)
+            patch.setattr(plan, "ADJOINT_THREADS", 32)
             patch.setattr(plan, "TEAM_THREADS", 32)
             patch.setattr(plan, "SMALL", 40)
         patch.setattr(kernels, "forward", launcher.forward)

@@ -93,13 +93,13 @@ def test_two_bodies_in_one_block() -> None:
     assert not second.kernel.shared and second.arguments.status == first.arguments.status
 
 
-def test_double_precision_takes_a_block_where_its_nodes_fit() -> None:
-    on_h100 = launches(window(2000), dtype=torch.float64)
-    assert [one.kernel.shared for one in on_h100] == [True, False]
-    assert on_h100[0].arguments.rows >= plan.SMALLEST_WINDOW
-    assert [one.kernel.shared for one in launches(window(2000), dtype=torch.float64, card=RTX_4090)] == [False]
-    on_4090 = launches(window(2000), card=RTX_4090)
-    assert on_4090[0].kernel.shared and on_4090[0].launch.shared_bytes <= RTX_4090.shared_bytes
+@pytest.mark.parametrize("card", [H100, RTX_4090])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_windows_are_as_large_as_the_memory_of_a_block(card: Card, dtype: torch.dtype) -> None:
+    first, second = launches(window(2000), dtype=dtype, card=card)
+    side, node = first.arguments.rows, first.kernel.node_bytes
+    assert first.kernel.shared and not second.kernel.shared and first.arguments.columns == side
+    assert first.launch.shared_bytes <= card.shared_bytes < first.launch.shared_bytes + 2 * (side + 1) * node
 
 
 def test_a_card_that_cannot_run_a_block() -> None:

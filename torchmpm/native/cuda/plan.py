@@ -7,12 +7,13 @@ from torchmpm.grid import PAD
 from torchmpm.native.cuda.arguments import Kernel
 from torchmpm.native.cuda.driver import Card
 
-#: Threads of a block with the nodes of a robot in shared memory, and of the blocks that share a robot.
-SHARED_THREADS, TEAM_THREADS = 512, 256
+#: Threads of a block with the nodes of a robot in shared memory, forward and in the adjoint, and of the blocks that
+#: share a robot. More of them would spill registers, in double precision more than half as many.
+SHARED_THREADS, ADJOINT_THREADS, TEAM_THREADS = 512, 384, 256
 #: Particles that a thread keeps in registers without spilling them. Of more, it keeps none there.
 PER_THREAD = 4
-#: The least side of a window in shared memory: a robot of the tasks needs about as many nodes.
-SMALLEST_WINDOW = 48
+#: Side of a window in shared memory below which no robot would fit.
+SMALLEST_WINDOW = 16
 #: Robots of up to so many particles get a block each. So do larger ones that keep this share of a card busy: additions
 #: in shared memory are so much faster that the rest of it may be idle. Estimates, which no card has confirmed yet.
 SMALL, BUSY = 4096, 1 / 8
@@ -69,11 +70,15 @@ def passes(call: Call, card: Card, resident: Resident) -> list[Pass]:
 
 
 def shared_pass(call: Call, card: Card, resident: Resident) -> Pass | None:
-    """One block for each robot, with its nodes in shared memory; ``None`` where blocks had better share a robot."""
+    """One block for each robot, with its nodes in shared memory; ``None`` where blocks had better share a robot.
+
+    The window is as large as the memory allows: two bodies may be far apart. Robots that do not fit are given up before
+    their first substep.
+    """
     if call.are_few(card) and call.particles > SMALL:
         return None
-    per_thread = -(-call.particles // SHARED_THREADS)
-    kernel = _kernel(call, shared=True, threads=SHARED_THREADS, per_thread=per_thread)
+    threads = (ADJOINT_THREADS if call.adjoint else SHARED_THREADS) // (2 if call.real == "double" else 1)
+    kernel = _kernel(call, shared=True, threads=threads, per_thread=-(-call.particles // threads))
     for side in range(call.width, min(call.width, SMALLEST_WINDOW) - 1, -1):
         size = kernel.shared_bytes(side, side, call.bodies, call.rules)
         if size <= card.shared_bytes:
