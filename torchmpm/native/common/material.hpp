@@ -21,14 +21,6 @@ constexpr int VALUES = 8;
 constexpr Real LARGEST_JP = Real(1e30);      // as in snow.py
 constexpr Real LARGEST_STRAIN = Real(0.03);  // as in snow.py
 
-// Column k of a block whose particles have their own values, or the only column.
-template <bool varying> INLINE Values values_at(const Real* table, int k) {
-    const Real* t = table + k;
-    const int stride = varying ? LANES : 1;
-    return {t[0],          t[stride],     t[2 * stride], t[3 * stride],
-            t[4 * stride], t[5 * stride], t[6 * stride], t[7 * stride]};
-}
-
 struct Bounds {
     Real hardening_low, hardening_high, shear_cutoff, resolved_rate, stretch_floor;
 };
@@ -46,11 +38,11 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
     const bool outside = small > m.tanh2 * large;
-    const Real difference = std::sqrt(small);  // may be zero where the particle does not yield
+    const Real difference = math::sqrt(small);  // may be zero where the particle does not yield
     const Real major = at_least(Real(0.5) * (R.total + difference), bounds.stretch_floor);
     const Real minor = at_least(Real(0.5) * (R.total - difference), bounds.stretch_floor);
     const bool yields = outside & (major > minor * m.exp);
-    const Real mean = Real(0.5) * std::sqrt(major * minor);
+    const Real mean = Real(0.5) * math::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 / difference);
     const Mat2 returned = from_polar_parts(
         {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.sign});
@@ -58,18 +50,16 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     return R;
 }
 
-INLINE Real clamp(Real s, Real low, Real high) { return s < low ? low : (s > high ? high : s); }
-
 INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
     const Real low = m.low(), high = m.high();
     const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real along = v.n1 * R.cos + v.n2 * R.sin;
-    const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
+    const bool drop = math::fabs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
     const Real n1 = drop ? along * R.cos : v.n1, n2 = drop ? along * R.sin : v.n2;
     const Real square2 = square(n1) + square(n2);
     const bool isotropic = square2 == 0;
-    const Real root = std::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
+    const Real root = math::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const bool kept = (first <= high) & (second >= low);
@@ -95,7 +85,7 @@ template <Kind kind> INLINE Real hardening_factor(const Values& m, Bounds bounds
 // Kirchhoff stress of the fixed corotated solid plus the muscles' F diag(actuation) F^T.
 template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Direction R, Real act_x, Real act_y) {
     const Mat2 D = F + Real(-1) * orthogonal(R);
-    const Real J = kind == Kind::snow ? std::abs(det(F)) : det(F);
+    const Real J = kind == Kind::snow ? math::fabs(det(F)) : det(F);
     const Real pressure = hard * m.lam * (J * (J - 1)), mu2 = hard * m.mu2;
     // P F^T with the first Piola-Kirchhoff stress but its pressure
     const Mat2 P{mu2 * D.a + act_x * F.a, mu2 * D.b + act_y * F.b, mu2 * D.c + act_x * F.c, mu2 * D.d + act_y * F.d};

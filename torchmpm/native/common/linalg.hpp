@@ -1,6 +1,6 @@
 // 2x2 matrices as the sum of a scaled rotation and a scaled reflection, see torchmpm/materials/linalg.py.
 #pragma once
-#include "simd.hpp"
+#include "scalar.hpp"
 
 struct Mat2 {
     Real a, b, c, d;  // row by row
@@ -45,7 +45,7 @@ struct Direction {
 INLINE Direction direction(PolarParts v) {
     const Real length2 = square(v.m1) + square(v.m2);
     const bool empty = length2 == 0;
-    const Real total = std::sqrt(empty ? Real(1) : length2), inverse = 1 / total;
+    const Real total = math::sqrt(empty ? Real(1) : length2), inverse = 1 / total;
     return {empty ? Real(0) : total, inverse, empty ? Real(1) : v.m1 * inverse, v.m2 * inverse, v.sign, empty};
 }
 

@@ -28,7 +28,7 @@ INLINE void stress_adjoint(const Values& m, Real hard, Real tangent, Mat2 F, Dir
     const PolarParts R_bar = polar_parts(D_bar, R.sign);
     out.R = {0, -R_bar.m1, -R_bar.m2};
 
-    const Real signed_J = det(F), J = kind == Kind::snow ? std::abs(signed_J) : signed_J;
+    const Real signed_J = det(F), J = kind == Kind::snow ? math::fabs(signed_J) : signed_J;
     const Real J_bar = (xx + yy) * tangent * m.lam * (2 * J - 1);
     const Real side = kind != Kind::snow ? Real(1) : signed_J > 0 ? Real(1) : signed_J < 0 ? Real(-1) : Real(0);
     const Real area = side * J_bar;
@@ -68,12 +68,12 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
     const bool outside = small > m.tanh2 * large;
-    const Real total = outside ? R.total : Real(1), inverse = 1 / std::sqrt(outside ? small : Real(0.25));
+    const Real total = outside ? R.total : Real(1), inverse = 1 / math::sqrt(outside ? small : Real(0.25));
     const Real difference = outside ? small * inverse : Real(0.5);
     const Real first = Real(0.5) * (total + difference), second = Real(0.5) * (total - difference);
     const Real major = at_least(first, bounds.stretch_floor), minor = at_least(second, bounds.stretch_floor);
     const bool yields = outside & (major > minor * m.exp);
-    const Real mean = Real(0.5) * std::sqrt(major * minor);
+    const Real mean = Real(0.5) * math::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 * inverse);
 
     const PolarParts v_bar = polar_parts(F_bar, v.sign);
@@ -101,11 +101,11 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     const PolarParts v = polar_parts(F);
     const Direction R = direction(v);
     const Real along = v.n1 * R.cos + v.n2 * R.sin;
-    const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
+    const bool drop = math::fabs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
     const Real n1 = drop ? along * R.cos : v.n1, n2 = drop ? along * R.sin : v.n2;
     const Real square2 = square(n1) + square(n2);
     const bool isotropic = square2 == 0;
-    const Real root = std::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
+    const Real root = math::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const bool kept = (first <= high) & (second >= low);
