@@ -6,7 +6,7 @@ PIP_FLAGS ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt $(PIP_FLAGS)
 STAMP := .venv/.stamp-install
-TRITON_STAMP := .venv/.stamp-triton
+CUDA_STAMP := .venv/.stamp-cuda
 DOCS_STAMP := .venv/.stamp-docs
 DEMO := runs/demo
 # Each takes up to 1 GB of memory. Idle processes take tests from busy ones.
@@ -14,7 +14,7 @@ TEST_PROCESSES ?= 2
 PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench wheel test-wheel clean
+.PHONY: help install demo test test-all cuda-kernels gpu test-oldest coverage lint docs bench wheel test-wheel clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -39,9 +39,9 @@ $(DOCS_STAMP): $(STAMP)
 
 # Threads that wait for each other by spinning stall for seconds as soon as another program wants a core. For
 # benchmarks, which have the machine to themselves, spinning is faster.
-demo test test-all test-gpu-kernels test-oldest coverage: export OMP_WAIT_POLICY ?= PASSIVE
+demo test test-all cuda-kernels test-oldest coverage: export OMP_WAIT_POLICY ?= PASSIVE
 # A short spin before they sleep: without it updates of the networks take a third longer.
-demo test test-all test-gpu-kernels test-oldest coverage: export GOMP_SPINCOUNT ?= 10000
+demo test test-all cuda-kernels test-oldest coverage: export GOMP_SPINCOUNT ?= 10000
 
 demo: install  ## train a small policy on SHAPE MATCH, with a video and a learning curve at the end
 	$(BIN)/python -m cfp.train --task shapematch --preset quick --steps 3200 --seed 0 --device cpu --out $(DEMO) --resume
@@ -53,14 +53,29 @@ test: install  ## fast tests
 test-all: install  ## all tests, slow ones and those for CUDA included
 	$(BIN)/python $(PYTEST) -m ""
 
-# torch's builds for CUDA bring Triton along, in a version of their choice.
-$(TRITON_STAMP): $(STAMP)
-	@echo "Installing Triton (a large download the first time) ..."
-	@$(BIN)/python -c "import triton" 2>/dev/null || $(PIP) "triton>=3.3"
+$(CUDA_STAMP): $(STAMP)
+	@echo "Installing NVIDIA's compiler of kernels ..."
+	@$(PIP) -e ".[cuda13]"
 	@touch $@
 
-test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else in an interpreter and a compiler
-	$(BIN)/python -m pytest -m "" tests/torchmpm/test_cuda_*.py
+cuda-kernels: $(CUDA_STAMP)  ## compile the CUDA kernels for all cards, and run all of their tests; needs no GPU
+	$(BIN)/python benchmarks/cuda_kernels.py
+	$(BIN)/python $(PYTEST) -m "" tests/torchmpm/test_cuda_*.py
+
+# What of PyTorch and CUDA is installed outside is seen inside, and not installed again. Without a network, WHEELS names a
+# folder with wheels of the packages that are missing, and of setuptools.
+.venv-gpu/.stamp: pyproject.toml
+	@rm -rf .venv-gpu && $(PYTHON) -m venv .venv-gpu
+	@$(PYTHON) -c "import sys; print(*(p for p in sys.path if p.endswith('-packages')), sep='\n')" \
+		> $$(.venv-gpu/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/outside.pth
+	@.venv-gpu/bin/python -m pip install -qq --disable-pip-version-check $(if $(WHEELS),--no-index --find-links $(WHEELS)) \
+		$(PIP_FLAGS) -e ".[$$($(PYTHON) benchmarks/gpu.py --extra)]"
+	@touch $@
+
+gpu:  ## checks, speed and trainings on a GPU in eight minutes; without one, tiny ones on an imitation of it
+	@if $(PYTHON) -c "import sys, torch; sys.exit(not torch.cuda.is_available())" 2>/dev/null; \
+	then $(MAKE) .venv-gpu/.stamp && .venv-gpu/bin/python benchmarks/gpu.py $(GPU_FLAGS); \
+	else $(MAKE) install && $(BIN)/python benchmarks/gpu.py $(GPU_FLAGS); fi
 
 # In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch

@@ -7,7 +7,7 @@ from importlib import import_module
 
 #: Module of each program, with a function ``main``, and what it does.
 PROGRAMS = {
-    "train": ("cfp.experiment.training", "train a policy on a task, by the coarse-to-fine method or another --algo"),
+    "train": ("cfp.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
     "evaluate": ("cfp.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
     "robustness": ("cfp.robustness", "returns of a policy in disturbed simulations"),
     "play": ("cfp.play.__main__", "play with a robot on a page in the browser"),

@@ -4,12 +4,12 @@ import sys
 from collections.abc import Sequence
 
 import baselines.registry  # noqa: F401  (adds the algorithms)
-from cfp.experiment import training
+from cfp import train
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return training.main(arguments, "baselines.train")
+    return train.main(arguments, "baselines.train")
 
 
 if __name__ == "__main__":

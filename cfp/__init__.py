@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cfp.analytic.learner import CFPAnalytic
     from cfp.envs.vec_env import TorchVecEnv
     from cfp.runs import Run, fit
-    from cfp.sac.algorithm import CFP
+    from cfp.sac.learner import CFP
     from cfp.sac.policies import CFPPolicy
 
 __all__ = [
@@ -41,7 +41,7 @@ __all__ = [
 
 # Imported on first use: loading a policy needs neither stable-baselines3 nor TensorBoard, which it imports.
 _ON_FIRST_USE = {
-    "CFP": "cfp.sac.algorithm",
+    "CFP": "cfp.sac.learner",
     "CFPAnalytic": "cfp.analytic.learner",
     "CFPPolicy": "cfp.sac.policies",
     "ImageFeatures": "cfp.agent.features",

@@ -99,8 +99,6 @@ class RunConfig(EnvironmentConfig, TaskConfig):
     """Environment steps between rows of progress.csv and TensorBoard points."""
     video: bool = True
     """Record video.mp4 at the end."""
-    video_every: int = 0
-    """Environment steps between videos of one episode in videos/; 0: none."""
     wandb: Literal["off", "offline", "online"] = "off"
     """Weights & Biases: off, offline (kept in the folder of the run), or online (uploads)."""
     wandb_project: str = "torchmpm"
@@ -108,7 +106,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
 
     changeable: ClassVar[tuple[str, ...]] = (
         *("device", "backend", "eval_every", "checkpoint_every", "log_every"),
-        *("video", "video_every", "wandb", "wandb_project"),
+        *("video", "wandb", "wandb_project"),
     )
     """Options that a resumed run may change."""
 
@@ -179,7 +177,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
             raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
         check_at_least(1, num_envs=self.num_envs, eval_episodes=self.eval_episodes, log_every=self.log_every)
         check_at_least(1, checkpoint_every=self.checkpoint_every)
-        check_at_least(0, eval_every=self.eval_every, video_every=self.video_every)
+        check_at_least(0, eval_every=self.eval_every)
         if self.substeps is not None:
             check_at_least(1, substeps=self.substeps)
         check_positive(dt=self.dt)
@@ -292,8 +290,6 @@ class LearningConfig:
 
     learning_rate: float = 3e-4
     """Adam's step size for actor and critics."""
-    actor_rate: float | None = None
-    """Adam's step size for the actor alone; None: the same as for the critics."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -306,10 +302,6 @@ class LearningConfig:
     """Updates after each batched step of num_envs robots."""
     update_start: int = 256
     """Updates begin when more transitions than this are stored."""
-    reward_momentum: float = 0.99
-    """Momentum of the running mean and variance of the rewards."""
-    max_grad_norm: float = 10.0
-    """Largest gradient norm of each parameter tensor."""
     n_steps: int = 1
     """Steps whose rewards a critic's target sums up."""
     final_rate: float = 1.0
@@ -330,11 +322,9 @@ class LearningConfig:
             raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
         if self.n_steps > 1 and self.gamma == 1:
             raise ConfigError("gamma must be below 1 with several n_steps, got 1")
-        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
+        check_fraction(gamma=self.gamma, tau=self.tau, final_rate=self.final_rate)
         check_decay(weight_average=self.weight_average)
-        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
-        if self.actor_rate is not None:
-            check_positive(actor_rate=self.actor_rate)
+        check_positive(learning_rate=self.learning_rate)
 
 
 @dataclass(frozen=True, kw_only=True)

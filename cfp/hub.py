@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.files import write_text
 
 SCHEME = "hf://"
-_ADDRESS = re.compile(rf"{SCHEME}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?(?:\?sha256=([0-9a-f]{{64}}))?")
+_ADDRESS = re.compile(rf"{SCHEME}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 FILE = "policy.safetensors"
 
 
@@ -29,35 +28,26 @@ def download(address: str) -> Path:
     """Download a policy into the cache of huggingface_hub, and print the address of its commit.
 
     Args:
-        address: ``hf://OWNER/NAME``, with ``@REVISION`` (a branch, a tag or a commit) and ``?sha256=HASH`` if wanted.
+        address: ``hf://OWNER/NAME``, with ``@REVISION`` (a branch, a tag or a commit) if wanted.
 
     Returns:
         The file ``policy.safetensors``.
 
     Raises:
-        CheckpointError: The address has another form, nothing can be downloaded, or the file has another hash than
-            the address says.
+        CheckpointError: The address has another form, or nothing can be downloaded.
         ConfigError: huggingface_hub is not installed.
     """
     found = _ADDRESS.fullmatch(address)
     if found is None:
-        raise CheckpointError(f"path must have the form {SCHEME}OWNER/NAME[@REVISION][?sha256=HASH], got {address!r}")
-    repo, revision, expected = found.groups()
+        raise CheckpointError(f"path must have the form {SCHEME}OWNER/NAME[@REVISION], got {address!r}")
+    repo, revision = found.groups()
     hub = _library()
     try:
         file = Path(hub.hf_hub_download(repo, FILE, revision=revision))
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except Exception as error:  # without a network, also those of the library that carries the requests
         raise CheckpointError(f"{address}: cannot be downloaded ({' '.join(str(error).split())})") from error
-    if expected not in (None, digest):
-        raise CheckpointError(f"{address}: {FILE} must have the SHA-256 {expected}, got {digest}")
-    print(f"{address}: {_pinned(repo, file.parent.name, digest)}", file=sys.stderr)
+    print(f"{address}: {SCHEME}{repo}@{file.parent.name}", file=sys.stderr)
     return file
-
-
-def _pinned(repo: str, commit: str, digest: str) -> str:
-    """Address of one commit of a repository, with the hash of its policy."""
-    return f"{SCHEME}{repo}@{commit}?sha256={digest}"
 
 
 class Shareable:
@@ -80,7 +70,7 @@ class Shareable:
             private: Create the repository as a private one.
 
         Returns:
-            The address of this commit for `cfp.load`, with the hash of the policy.
+            The address of this commit for `cfp.load`.
 
         Raises:
             ConfigError: The policy comes from no run, so that its task is not known, or the hub refuses it.
@@ -89,9 +79,7 @@ class Shareable:
             raise ConfigError(f"policy must come from a run, got one with the description {self.description}")
         hub = _library()
         with TemporaryDirectory() as folder:
-            file = Path(folder) / FILE
-            self.save(file)
-            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            self.save(Path(folder) / FILE)
             write_text(Path(folder) / "README.md", _card(repo, self.description, results))
             try:
                 hub.create_repo(repo, private=private, exist_ok=True)
@@ -100,7 +88,7 @@ class Shareable:
                 )
             except Exception as error:
                 raise ConfigError(f"repo: cannot push to {repo!r} ({' '.join(str(error).split())})") from error
-        return _pinned(repo, commit.oid, digest)
+        return f"{SCHEME}{repo}@{commit.oid}"
 
 
 def _card(repo: str, description: Mapping[str, Any], results: Sequence[Mapping[str, Any]]) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import hashlib
 import json
 import math
 import os
@@ -32,7 +31,6 @@ from dittogym import make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES
 from dittogym.observation import SHAPE
-from dittogym.tasks import fingerprint
 from dittogym.torch_env import find_device
 
 # Arguments of `predict` in stable-baselines3.
@@ -57,10 +55,8 @@ _DESCRIBED: dict[str, type | range] = {
     "deterministic": bool,
     "environment": dict,
     "layout": range(LARGEST_SEED + 1),  # of a policy for one initial position
-    "task_file": str,
-    "target_picture": str,
 }
-_OPTIONAL = ("layout", "task_file", "target_picture")
+_OPTIONAL = ("layout",)
 #: Words of the file format for the two kinds of networks, and those of `ActorSpec.encoder`.
 _ENCODERS = {"full": "paper", "lean": "small"}
 #: Characters shown of an error of torch, which lists every layer.
@@ -202,7 +198,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     Args:
         path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, the name of a policy that comes with
             the package, such as ``"run"``, or ``"hf://OWNER/NAME"`` on the Hugging Face Hub, with ``@REVISION`` (a
-            branch, a tag or a commit) and ``?sha256=HASH`` if wanted.
+            branch, a tag or a commit) if wanted.
         device: Device of its tensors.
 
     Returns:
@@ -368,20 +364,7 @@ def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[s
         "seed": config.seed,
         "deterministic": config.eval_deterministic,
         "environment": dataclasses.asdict(config.environment),
-    } | _contents(config)
-
-
-def _contents(config: RunConfig) -> dict[str, str]:
-    """SHA-256 of the files that the task's options name: that of a custom task, and a chosen target picture."""
-    target = Path(config.target or "")
-    picture = hashlib.sha256(target.read_bytes()).hexdigest() if target.is_file() else None
-    files = {"task_file": fingerprint(config.task), "target_picture": picture}
-    return {name: value for name, value in files.items() if value is not None}
-
-
-def is_of_another_task(description: Mapping[str, Any], config: RunConfig) -> bool:
-    """Whether the file of a custom task, or a target picture, has changed since a policy was trained."""
-    return any(description.get(name, value) != value for name, value in _contents(config).items())
+    }
 
 
 def policy_for(config: RunConfig, path: str) -> ActorPolicy:

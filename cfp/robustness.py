@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
-from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, reason_without_effect
-from cfp.envs.make import batch_size
+from cfp.envs.disturbances import FRICTION, Case, changes_something, disturbed_env, make_cases
 from cfp.errors import ConfigError, check_at_least
 from cfp.evaluate import Selection
 from cfp.evaluation.page import write_figure
-from cfp.evaluation.returns import Result, Trial, decision_grid, evaluate, evaluation_seed, numbers
+from cfp.evaluation.returns import Result, evaluate, evaluation_seed, make_trial, numbers
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import write_json, write_text
@@ -80,14 +79,10 @@ class Command(Selection):
 
 def choose(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: Policy) -> list[Case]:
     """The first case, and those whose names hold one of the words, if any; each word must choose one with an effect."""
-    reasons = {case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:]}
+    names = [case.name for case in cases[1:] if changes_something(case, spec, policy.uses_image)]
     for word in words:
-        chosen = {name: reason for name, reason in reasons.items() if word in name}
-        if not chosen:
-            raise ConfigError(f"cases must be words of {', '.join(reasons)}, got {word!r}")
-        if all(chosen.values()):
-            explained = "; ".join(f"{name}: {reason}" for name, reason in chosen.items())
-            raise ConfigError(f"cases must be words of cases that change something, got {word!r} ({explained})")
+        if not any(word in name for name in names):
+            raise ConfigError(f"cases must be words of {', '.join(names)}, got {word!r}")
     return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 
@@ -104,20 +99,15 @@ def report(
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = config.make_spec(), evaluation_seed(config)
-    grid = decision_grid(policy)
+    trial = make_trial(config, "", policy, episodes, deterministic=deterministic, seed=seed)
     trials = [
-        Trial(
+        replace(
+            trial,
             name=case.name,
-            resolution=grid,
-            policy=policy,
-            make_env=partial(disturbed_env, config, policy.resolution, case, grid),
-            episodes=episodes,
-            deterministic=deterministic,
-            seed=seed,
-            batch=batch_size(config, episodes),
+            make_env=partial(disturbed_env, config, policy.resolution, case, trial.resolution),
         )
         for case in cases
-        if not reason_without_effect(case, spec, policy.uses_image)
+        if changes_something(case, spec, policy.uses_image)
     ]
     return evaluate(trials, spec.horizon if progress else None)
 

@@ -14,11 +14,11 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.video import record_policy
 from cfp.experiment.cli import Stopped, keep_memory
 from cfp.experiment.folder import parse_folder, policy_path, read_config
-from cfp.experiment.training import from_python, train
 from cfp.files import parse_json
 from cfp.hub import Shareable
 from cfp.policy import Policy
 from cfp.tables import read_table
+from cfp.train import from_python, train
 from dittogym.render.recording import Recording, check_film
 
 

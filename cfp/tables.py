@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -84,7 +84,6 @@ class Column:
     key: str  # in the rows, and the name in the CSV file
     title: str = ""  # an empty one restricts the column to the CSV file
     format: str = ""  # of numbers; columns without one hold text
-    value: Callable[[Any], Any] | None = None  # from the subject of a row to its value, for `make_row`
 
     def text(self, row: Row) -> str:
         """The value of a row, for readers."""
@@ -97,11 +96,6 @@ class Column:
 def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
     """Several columns of one format, as ``key="title"``."""
     return tuple(Column(key, title, format) for key, title in titles.items())
-
-
-def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
-    """The values of all columns that have a ``value`` function."""
-    return {column.key: column.value(subject) for column in columns if column.value is not None}
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import pkgutil
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import dittogym
 from baselines.compare import paper
@@ -31,7 +32,7 @@ INF = math.inf
 METRICS = {
     "all": ("cfp.experiment.callbacks.LOG_METRICS", "cfp.experiment.callbacks.EVALUATION_METRICS"),
     "`cfp-analytic`": ("cfp.analytic.learner.METRICS",),
-    "`cfp-sac`": ("cfp.sac.learner.ROLLOUT_METRICS", "cfp.sac.algorithm.METRICS"),
+    "`cfp-sac`": ("cfp.sac.learner.METRICS",),
     "`shac`": ("baselines.shac.METRICS",),
     "`distill`": ("baselines.distillation.learner.METRICS",),
     "`gradient`": ("baselines.trajectory.METRICS",),
@@ -231,6 +232,48 @@ def costs() -> str:
     return markdown(("task", "particles", *columns[1:]), lines)
 
 
+def gpu_run() -> dict[str, Any]:
+    """The last results of `make gpu`: the card, the date, and the rows of the stage `speed` by their names."""
+    files = (ROOT / "benchmarks/gpu").glob("*.json")
+    found = max((json.loads(path.read_text()) for path in files), key=lambda result: result["date"], default=None)
+    if found is None:
+        return {"card": "no card has run `make gpu` yet", "speed": {}}
+    card = next(row["figures"]["card"] for row in found["rows"] if row["check"] == "versions")
+    speed = {row["check"]: row for row in found["rows"] if row["stage"] == "speed" and not row["wrong"]}
+    return {"card": f"{card}, {found['date']}", "speed": speed}
+
+
+def rate(row: dict[str, Any] | None, name: str) -> str:
+    """A speed of a row, or nothing."""
+    return number(str(row["figures"].get(f"{name} (steps/s)", ""))) if row else ""
+
+
+def gpu() -> str:
+    """Environment steps a second on the card that ran `make gpu` last."""
+    run, columns = gpu_run(), ("physics", "physics with gradient", "env.step", "env.step with gradient")
+    rows = [
+        [f"{name} ({row['backend']})", *(rate(row, column) for column in columns)]
+        for name, row in run["speed"].items()
+        if "physics (steps/s)" in row["figures"]
+    ]
+    return markdown(("Robots × particles", *columns), rows or [[run["card"], *[""] * len(columns)]])
+
+
+def gpu_line() -> str:
+    """The same in a line."""
+    run = gpu_run()
+    one, many = (run["speed"].get(name) for name in ("1 × full", "1024 × lite"))
+    cells = [rate(one, "env.step"), rate(many, "env.step"), rate(many, "env.step with gradient")]
+    columns = ("RUN, steps/s", "1 robot, 22,000 particles", "1,024 robots of 2,000", "1,024 with gradients")
+    return markdown(columns, [[run["card"], *cells]])
+
+
+def cuda_kernels() -> str:
+    """Registers, spills and shared memory of the CUDA kernels."""
+    rows = json.loads((DOCS / "cuda-kernels.json").read_text())["rows"]
+    return markdown(list(rows[0]), (list(row.values()) for row in rows))
+
+
 def from_csv(name: str) -> str:
     """A CSV file as it is."""
     rows = read(name)
@@ -363,7 +406,10 @@ TABLES: dict[str, Callable[..., str]] = {
     "constants": constants,
     "costs": costs,
     "csv": from_csv,
+    "cuda-kernels": cuda_kernels,
     "geometry": geometry,
+    "gpu": gpu,
+    "gpu-line": gpu_line,
     "leaderboard": leaderboard,
     "metrics": metrics,
     "planning": planning,
@@ -378,7 +424,8 @@ TABLES: dict[str, Callable[..., str]] = {
 def pages() -> list[Path]:
     """Pages that contain tables."""
     built = {"_build", "gallery"}
-    found = [ROOT / "README.md", *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
+    own = (ROOT / "README.md", ROOT / "benchmarks/README.md")
+    found = [*own, *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
     return [path for path in sorted(found) if BLOCK.search(path.read_text())]
 
 

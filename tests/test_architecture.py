@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 #: A package may import itself and those to its left.
 ORDER = ("torchmpm", "dittogym", "cfp", "baselines")
-#: All that the physics may import besides itself; Triton only in the CUDA kernels.
+#: All that the physics may import besides itself; NVIDIA's packages only where the kernels are compiled and launched.
 PHYSICS_IMPORTS = {"jaxtyping", "numpy", "torch", *sys.stdlib_module_names}
 CUDA_KERNELS = Path("torchmpm/native/cuda")
 #: Functions that change what the whole process shares, and those that draw from a shared generator unless given one.
@@ -68,7 +68,7 @@ def test_imports_run_one_way(package: str) -> None:
             tops = {name.split(".")[0] for name in imported(tree)}
             assert tops.isdisjoint(set(ORDER) - set(allowed)), path
             if package == "torchmpm":
-                known = PHYSICS_IMPORTS | ({"triton"} if path.is_relative_to(CUDA_KERNELS) else set())
+                known = PHYSICS_IMPORTS | ({"cuda"} if path.is_relative_to(CUDA_KERNELS) else set())
                 assert tops <= known | {"torchmpm"}, path
 
 

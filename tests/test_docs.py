@@ -15,6 +15,8 @@ import drawings  # noqa: E402
 import media  # noqa: E402
 import tables  # noqa: E402
 
+from torchmpm.native.cuda.compiler import digest_of_sources  # noqa: E402
+
 
 @pytest.mark.parametrize("page", tables.pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_tables_are_current(page):
@@ -52,3 +54,9 @@ def test_no_line_of_a_page_is_a_comment():
     """In MyST a line that begins with a percent sign is left out of the page."""
     for page in (*ROOT.glob("*.md"), *DOCS.rglob("*.md")):
         assert not re.search(r"^\s*%", page.read_text(), re.MULTILINE), page
+
+
+def test_registers_are_those_of_the_present_kernels():
+    """Compiled by a version of NVRTC that need not be here."""
+    current = json.loads((DOCS / "cuda-kernels.json").read_text())["sources"] == digest_of_sources()
+    assert current, "python benchmarks/cuda_kernels.py --out docs/cuda-kernels.json compiles them anew"

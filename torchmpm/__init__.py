@@ -3,7 +3,7 @@
 :class:`ParticleState` holds everything that moves. :meth:`Solver.step` takes a state and returns a new one; the solver
 is a frozen description of grid, bodies and boundary. ``substep`` is the algorithm, ``materials`` holds the
 constitutive laws, and ``native`` the same substep as fused kernels. This package imports torch, NumPy and jaxtyping,
-and Triton for the CUDA kernels.
+and NVIDIA's cuda-core for the kernels on a GPU.
 """
 
 from torchmpm import diagnostics, sampling, tree

@@ -1,6 +1,7 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from dataclasses import dataclass, fields
+import functools
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,12 +16,15 @@ from torchmpm.backends import BACKENDS, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.checks import Segment
 from torchmpm.grid import PAD, Grid
-from torchmpm.materials.base import Value, try_law
+from torchmpm.materials.base import Value, lame, try_law
 from torchmpm.materials.body import Body, per_particle, slices
+from torchmpm.materials.von_mises import VonMises
+from torchmpm.native.cuda.compiler import unavailable
 from torchmpm.native.kernels import Kernels
 from torchmpm.native.library import NO_COMPILER, leave_parent_threads, load, provenance
 from torchmpm.native.tables import KINDS
 from torchmpm.rollout import repeated
+from torchmpm.sampling import disc, sobol
 from torchmpm.state import ParticleState
 from torchmpm.substep import Components, Scene, substep
 from torchmpm.tree import transforming
@@ -40,8 +44,8 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
-            (operator by operator), or ``"auto"``: native on a CPU where it works, else eager.
+        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, CUDA C++ on a GPU), ``"eager"``
+            (operator by operator), or ``"auto"``: native where it works, else eager.
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`, and gravity with which a particle at rest crosses a
             cell of the grid within a substep.
 
@@ -237,8 +241,8 @@ class Solver:
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
 
-        ``"auto"`` chooses them on the CPU wherever they work, and logs once why they do not. On CUDA only ``"native"``
-        does.
+        ``"auto"`` chooses them wherever they work, and logs once why they do not. On CUDA they must first agree with
+        the eager backend on a small scene, see :func:`kernels_fail`.
 
         Raises:
             ValueError: The backend is ``"native"`` and cannot run this.
@@ -251,8 +255,8 @@ class Solver:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
             return True
         if reason is None and state.device.type == "cuda":
-            reason = "on CUDA the native backend runs only if backend='native' asks for it"
-        if reason is None:
+            reason = kernels_fail(state.device, state.dtype)
+        elif reason is None:
             try:
                 load(state.dtype)
             except ValueError as error:
@@ -341,3 +345,39 @@ class Solver:
         if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
+
+
+@functools.cache
+def kernels_fail(device: torch.device, dtype: torch.dtype = torch.float32) -> str | None:
+    """Why the native kernels are not to be used on a device, or ``None``; found out once in a process.
+
+    A disc with muscles that hits the ground, and one so wide that the kernels treat it as they do large bodies, take a
+    few substeps with them and with the eager backend. States, and derivatives of a number that depends on all of them,
+    must agree.
+    """
+    if device.type == "cuda" and (reason := unavailable(device)) is not None:
+        return reason
+    body = Body(2000, VonMises(*lame(young=1e3, poisson=0.3), 20.0), mass=4e-3, volume=1.6e-5, muscle=True)
+    ground = VelocityRule("-y", j=(None, 5))
+    solver = Solver(Grid(128), (body,), (0.0, -9.8), rules=(ground,), backend="eager")
+    like = torch.empty(0, dtype=dtype, device=device)
+    found = []
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            points = torch.as_tensor(disc(sobol(2000, seed=0), centre=(0.0, 0.14), radius=0.1)).to(like)
+            points = torch.stack((points, points * like.new_tensor((4.0, 1.0)))) + like.new_tensor((0.5, 0.0))
+            waves = 30.0 * torch.arange(4 * 128**2, device=device).to(like).sin().view(2, 2, 128, 128)
+            for step in (partial(solver.kernels.step, gravity=solver.gravity), solver.step):
+                x, field = (t.clone().requires_grad_() for t in (points, waves))
+                start = replace(ParticleState.at_rest(x), v=torch.full_like(x, -1.0))
+                end = step(start, field, origin=like.new_zeros(2, 2), substeps=5)
+                loss = end.x.square().sum() + end.v.square().sum() + end.F.square().sum()
+                found.append((end.x, end.v, end.F, *torch.autograd.grad(loss, (x, field))))
+    except (ValueError, RuntimeError) as error:  # they cannot be compiled, or not launched
+        return f"its kernels were tried on {device}, and failed: {error}"
+    names = ("x", "v", "F", "the gradient in x", "the gradient in the field")
+    for name, ours, theirs in zip(names, *found, strict=True):
+        difference = float((ours - theirs).detach().abs().max() / theirs.detach().abs().max())
+        if not difference <= (3e-4 if dtype == torch.float32 else 1e-9):
+            return f"its kernels were tried on {device}, and {name} differed by {difference:.1e} from that of eager"
+    return None

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from cfp.analytic.reward import has_gradient
+from cfp.analytic.window import has_gradient
 from cfp.errors import ConfigError
 from dittogym import TorchEnv, core
 from dittogym.action import ActionLayout, to_grid_layout

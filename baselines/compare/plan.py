@@ -13,8 +13,8 @@ from baselines.registry import ALGORITHMS
 from cfp.config import EVALUATION_SEED, RunConfig, to_words
 from cfp.errors import ConfigError
 from cfp.experiment.run import check_options
-from cfp.experiment.training import from_python
 from cfp.files import read_json, write_json
+from cfp.train import from_python
 
 #: Options of a command line by name, with underscores.
 Options = dict[str, Any]

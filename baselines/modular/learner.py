@@ -88,7 +88,7 @@ class ModularConfig(LearningConfig, RunConfig):
 
 
 class ModularPolicy(NetworkPolicy):
-    """Actor and critics over segments, for `cfp.sac.algorithm.CFP`; observes rows (K, columns) of `Nodes`."""
+    """Actor and critics over segments, for `cfp.CFP`; observes rows (K, columns) of `Nodes`."""
 
     def __init__(self, *arguments: Any, kind: Kind, features: int, **options: Any) -> None:
         self.kind, self.features = kind, features

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from baselines.common.rollout import StepFunction, check_differentiable, rollout, soft_step
-from cfp.analytic.reward import split_cost
+from cfp.analytic.window import split_cost
 from cfp.errors import ConfigError, check_at_least
 from cfp.learner import Resumable
 from dittogym import TorchEnv

@@ -302,14 +302,12 @@ def image_of(observation: NetworkInput) -> Tensor:
 
 
 def halved(image: Tensor) -> Tensor:
-    """Normalised images (B, 3, 32, 32): means of 2 x 2 pixels of uint8 or normalised ones; others are done already."""
+    """Normalised images (B, 3, 32, 32): means of 2 x 2 pixels of uint8 images; smaller images are done already."""
     if image.shape[-1] < IMAGE_SIZE:
         return image
-    pixels = image if image.is_floating_point() else image.short()
+    pixels = image.short()
     rows = pixels[..., ::2, :] + pixels[..., 1::2, :]
     sums = rows[..., ::2] + rows[..., 1::2]
-    if image.is_floating_point():
-        return sums / 4
     return _channels_last(sums).float().mul_(2.0 / (4 * 255.0)).sub_(1.0)
 
 
@@ -321,7 +319,7 @@ class SmallEncoder(nn.Module):
         self.layers = Encoder(3, SMALL_WIDTH, IMAGE_SIZE // 2)
 
     def forward(self, observation: NetworkInput) -> Tensor:
-        """Features of uint8, normalised or `halved` images; those of `Encoded` observations are known."""
+        """Features of uint8 or `halved` images; those of `Encoded` observations are known."""
         if isinstance(observation, Encoded):
             return observation.features
         features: Tensor = self.layers(halved(observation))

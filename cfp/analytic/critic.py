@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from cfp.analytic.reward import discount_rate
-from cfp.analytic.window import Window, td_lambda_targets
+from cfp.analytic.window import Window, discount_rate, td_lambda_targets
 from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
 from cfp.learner import Resumable

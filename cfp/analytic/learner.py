@@ -1,4 +1,4 @@
-"""The learner: windows of simulation, a step on their actions, regression of the actor, and a critic.
+"""``cfp-analytic``: windows of simulation, a step on their actions, regression of the actor, and a critic.
 
 The policy sees the image only. The critic sees the state of the simulation, and is needed in training only.
 """
@@ -6,22 +6,31 @@ The policy sees the image only. The critic sees the state of the simulation, and
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.analytic.action_step import BOUND, ActionStep
-from cfp.analytic.critic import Critic, StateFeatures, mlp
-from cfp.analytic.regression import ImageMemory, Regression
+from cfp.analytic.critic import Critic, StateFeatures, descend, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import CoarseToFine, NetworksPolicy, Resumable, UpdateLoop, linear_decay, refines
+from cfp.learner import (
+    CoarseToFine,
+    NetworksPolicy,
+    Resumable,
+    UpdateLoop,
+    compress,
+    decompress,
+    linear_decay,
+    refines,
+)
 from cfp.presets import analytic_preset
 
 #: Every scalar that ``CFPAnalytic.update`` logs, and what it means.
@@ -35,6 +44,120 @@ METRICS: dict[str, str] = {
 }
 #: Training stops after so many windows in a row without any gradient.
 MOST_EMPTY_WINDOWS = 10
+#: Gradients of single actions longer than this many running medians are shortened to it.
+OUTLIER = 3.0
+#: Latest norms that the median is taken of.
+HISTORY = 2_000
+#: Largest magnitude of an improved mean, whose tanh is 0.987, and of an improved gate logit before its bias.
+BOUND = 2.5
+#: Of Adam in the regression.
+REGRESSION_BETAS = (0.9, 0.95)
+
+
+class ActionStep(Resumable):
+    """The first half of the update: better actions, by the gradient of a window (PODS; Mora et al., ICML 2021).
+
+    PODS takes Gauss-Newton or plain gradient steps on the actions of whole trajectories. Here the gradient covers a
+    window that ends in a critic's value, its outliers are limited, and the step, which is taken before tanh, has a
+    given size.
+
+    Attributes:
+        norms: Latest finite norms of single actions' gradients.
+        limited: How many gradients were shortened so far.
+    """
+
+    values = ("norms", "limited")
+
+    def __init__(self) -> None:
+        self.norms: list[float] = []
+        self.limited = 0
+
+    @torch.no_grad()
+    def __call__(self, locations: Tensor, gradients: Tensor, size: float) -> Tensor:
+        """Improved locations of the actions, see `cfp.agent.actor.Outputs.location`.
+
+        Args:
+            locations: (T, B, C, R, R).
+            gradients: Of the loss, with the same shape and finite.
+            size: Root mean square of the step.
+        """
+        gradients = gradients.double()  # squares of outliers overflow in single precision
+        norms = gradients.flatten(2).norm(dim=2)
+        self.norms = [*self.norms, *norms[norms > 0].tolist()][-HISTORY:]
+        if not self.norms:
+            return locations.clone()
+        largest = OUTLIER * float(np.median(self.norms))
+        self.limited += int((norms > largest).sum())
+        gradients = gradients * (largest / norms.clamp_min(largest))[..., None, None, None]
+        step = size * gradients / gradients.square().mean().sqrt().clamp_min(torch.finfo(torch.double).tiny)
+        return (locations - step.to(locations)).clamp(-BOUND, BOUND)
+
+
+class ImageMemory(Resumable):
+    """The latest pairs of an image (3, 64, 64) uint8 and the location (C, R, R) of the action to take there.
+
+    Args:
+        capacity: Number of pairs; older ones are overwritten.
+        example: An image and a location, for shapes, types and device.
+    """
+
+    values = ("locations", "count")
+
+    def __init__(self, capacity: int, example: tuple[Tensor, Tensor]) -> None:
+        self.images, self.locations = (part.new_zeros(capacity, *part.shape) for part in example)
+        self.count = 0
+
+    def add(self, images: Tensor, locations: Tensor) -> None:
+        """Store a batch of pairs."""
+        index = torch.arange(self.count, self.count + len(images), device=images.device) % len(self.images)
+        self.images[index], self.locations[index] = images, locations
+        self.count += len(images)
+
+    def sample(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A random batch of pairs, with replacement."""
+        stored = min(self.count, len(self.images))
+        index = torch.randint(stored, (size,), generator=generator).to(self.images.device)
+        return self.images[index], self.locations[index]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All pairs, the images compressed."""
+        return super().state_dict() | {"images": compress(self.images)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        super().load_state_dict(state)
+        self.images = decompress(state["images"], self.images.shape[1:]).to(self.images.device)
+
+
+class Regression(Resumable):
+    """The second half of the update: the actor learns the improved actions from images (PODS).
+
+    As in D.Va (NeurIPS 2025) no gradient passes through the rendering: images are inputs only. The running average of
+    the weights is the policy.
+
+    Args:
+        actor: Composed or plain; its standard deviation is not trained.
+        learning_rate: Adam's step size.
+        decay: Of the exponential average of the weights.
+        max_grad_norm: Largest norm of a gradient.
+    """
+
+    parts = ("actor", "average", "adam")
+
+    def __init__(self, actor: Actor, learning_rate: float, decay: float, max_grad_norm: float) -> None:
+        self.actor, self.max_grad_norm = actor, max_grad_norm
+        self.average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        self.adam = torch.optim.Adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
+
+    def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> Tensor:
+        """Take one step of Adam towards the ``locations`` of actions for ``images``; returns the mean squared error."""
+        self.adam.param_groups[0]["lr"] = learning_rate
+        self.adam.zero_grad()
+        loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)
+        loss.backward()
+        descend(self.adam, self.max_grad_norm, "actor's regression")
+        self.average.update_parameters(self.actor)
+        return loss.detach()
 
 
 class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):

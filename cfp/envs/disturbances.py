@@ -41,23 +41,18 @@ class Case:
     friction: float | None = None  # Coulomb coefficient of the floor; math.inf sticks, None keeps that of the task
 
 
-def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -> str:
-    """Why a case has no effect on a policy in a task; empty if it has one."""
+def changes_something(case: Case, spec: TaskSpec, uses_image: bool = True) -> bool:
+    """Whether a case has an effect on a policy in a task, or ``uses_image`` and the task's own constants forbid it."""
     if case.observation_dropout and not uses_image:
-        return "the policy does not use the image"
-    if "gravity" in case.physics and not any(spec.gravity):
-        return f"{spec.name} has no gravity"
-    if not all(has_effect(spec, name) for name in case.physics):
-        return f"the bodies of {spec.name} have their own materials"
+        return False
+    if ("gravity" in case.physics and not any(spec.gravity)) or not all(
+        has_effect(spec, name) for name in case.physics
+    ):
+        return False
     if case.friction is None:
-        return ""
-    floors = [item for item in spec.obstacles if item.name == FLOOR]
-    if not floors:
-        return f"{spec.name} has no obstacle named {FLOOR!r}"
-    present = {rule.friction for item in floors for rule in item.velocity_rules}
-    if not present:
-        return f"the floor of {spec.name} has no rules"
-    return f"the floor of {spec.name} has this friction" if present == {case.friction} else ""
+        return True
+    present = {rule.friction for item in spec.obstacles if item.name == FLOOR for rule in item.velocity_rules}
+    return bool(present) and present != {case.friction}
 
 
 def disturbed_env(

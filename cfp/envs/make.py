@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,16 +16,32 @@ from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.torch_env import find_device
+from torchmpm.solver import kernels_fail
+
+_logger = logging.getLogger(__name__)
 
 
 def choose_device(name: str) -> str:
-    """Resolve ``"auto"`` to CUDA if available, else to the CPU."""
+    """Resolve ``"auto"``: CUDA if there is a GPU that the kernels of the physics run on, else the CPU.
+
+    Without them a GPU would be slower than a CPU. The log says once why a GPU is not used.
+    """
     if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        return _automatic_device()
     try:
         return str(find_device(name))
     except ValueError as error:
         raise ConfigError(f"{error}; auto chooses one") from error
+
+
+@functools.cache
+def _automatic_device() -> str:
+    if not torch.cuda.is_available():
+        return "cpu"
+    reason = kernels_fail(torch.device("cuda", torch.cuda.current_device()))
+    if reason is not None:
+        _logger.warning("device auto is the CPU, because the physics would be slow on the GPU: %s", reason)
+    return "cuda" if reason is None else "cpu"
 
 
 def make_env(
@@ -42,16 +60,6 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
         return TorchEnv(config.task, resolution=resolution, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
-
-
-def batch_size(config: RunConfig, episodes: int) -> int:
-    """How many of some episodes share an environment: on a CPU none, so that each runs on a core of its own."""
-    return 1 if on_cpu(config) else episodes
-
-
-def on_cpu(config: RunConfig) -> bool:
-    """Whether a run simulates on a CPU."""
-    return torch.device(choose_device(config.device)).type == "cpu"
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.disturbances import Disturbed
-from cfp.envs.make import batch_size, make_env
+from cfp.envs.make import choose_device, make_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.policy import DisturbablePolicy, Memory, Observation, Policy, Start, StatePolicy
 from dittogym.render.recording import seed_noise
@@ -177,7 +177,7 @@ def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, d
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
-        batch=batch_size(config, episodes),
+        batch=1 if torch.device(choose_device(config.device)).type == "cpu" else episodes,
     )
 
 

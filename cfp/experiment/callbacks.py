@@ -1,4 +1,4 @@
-"""Callbacks between two updates of a stage: logs, evaluations, films, checkpoints, stopping."""
+"""Callbacks between two updates of a stage: logs, evaluations, checkpoints, stopping."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import importlib
 import sys
 import time
 import uuid
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoardOutputFormat, filter_excluded_keys
 from torch.utils.tensorboard import SummaryWriter
@@ -20,7 +18,6 @@ from tqdm import tqdm
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import EpisodesStopped, evaluate, make_trial
-from cfp.evaluation.video import record_episode
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.cli import Stopped, StopSignals
 from cfp.experiment.folder import policy_path
@@ -28,8 +25,6 @@ from cfp.files import write_text
 from cfp.learner import Learner
 from cfp.policy import describe_run
 from cfp.tables import CSVTable
-from dittogym.render.film import available
-from dittogym.render.recording import record
 
 #: Scalars that every algorithm logs beside its own.
 LOG_METRICS: dict[str, str] = {
@@ -80,16 +75,14 @@ class EventFile(TensorBoardOutputFormat):
         self._is_closed = False
 
 
-def check_trackers(config: RunConfig) -> None:
-    """Refuse options that need a package that is not installed, before anything is written."""
-    every, wandb, install = config.video_every, config.wandb, "install it with: pip install 'torchmpm"
-    if every and not available():
-        raise ConfigError(f"video_every must be 0 without imageio and its ffmpeg, got {every}; {install}[video]'")
-    if wandb != "off":
+def check_wandb(config: RunConfig) -> None:
+    """Refuse Weights & Biases where it is not installed, before anything is written."""
+    if config.wandb != "off":
         try:
             importlib.import_module("wandb")
         except ImportError as error:
-            message = f"wandb must be 'off' without the package wandb, got {wandb!r}; {install}[wandb]'"
+            install = "install it with: pip install 'torchmpm[wandb]'"
+            message = f"wandb must be 'off' without the package wandb, got {config.wandb!r}; {install}"
             raise ConfigError(message) from error
 
 
@@ -120,34 +113,15 @@ class WandbWriter(KVWriter):
         images = {name: self.wandb.Image(value.image) for name, value in given.items() if isinstance(value, Image)}
         self.run.log({**given, **images, "step": step})
 
-    def film(self, path: Path, step: int) -> None:
-        """Send a video."""
-        self.run.log({"video": self.wandb.Video(str(path), format="mp4"), "step": step})
-
     def close(self) -> None:
         """End the session."""
         self.run.finish()
 
 
-class Tracker:
-    """The places to which a run's rows go besides its tables, and pictures and films that only they take."""
-
-    def __init__(self, config: RunConfig, folder: Path, step: int) -> None:
-        self.wandb = WandbWriter(config, folder) if config.wandb != "off" else None
-        events = EventFile(folder / "tensorboard", step)
-        self.writers: list[KVWriter] = [events, self.wandb] if self.wandb else [events]
-        self._logger = Logger(None, self.writers)
-
-    def show(self, step: int, values: Mapping[str, float | np.ndarray | None]) -> None:
-        """Write scalars and pictures, uint8 (H, W, 3), at once and without a row in a table."""
-        for name, value in values.items():
-            self._logger.record(name, Image(value, "HWC") if isinstance(value, np.ndarray) else value)
-        self._logger.dump(step)
-
-    def film(self, step: int, path: Path) -> None:
-        """Send a video to Weights & Biases, if asked for; TensorBoard takes no files."""
-        if self.wandb:
-            self.wandb.film(path, step)
+def make_trackers(config: RunConfig, folder: Path, step: int) -> list[KVWriter]:
+    """The places to which a run's rows go besides its tables."""
+    events = EventFile(folder / "tensorboard", step)
+    return [events, WandbWriter(config, folder)] if config.wandb != "off" else [events]
 
 
 @dataclass
@@ -272,10 +246,10 @@ class EvaluationCallback(StageCallback):
     """
 
     def __init__(
-        self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback, signals: StopSignals
+        self, stage: Stage, table: CSVTable, trackers: Logger, bar: ProgressBarCallback, signals: StopSignals
     ) -> None:
         super().__init__(stage, stage.config.eval_every)
-        self.table, self.tracker, self.bar, self.signals = table, tracker, bar, signals
+        self.table, self.trackers, self.bar, self.signals = table, trackers, bar, signals
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
         self.evaluated = int(rows[-1]["step"]) if rows else 0  # step of the last evaluation
@@ -311,7 +285,11 @@ class EvaluationCallback(StageCallback):
         values = stage.step, stage.number, episodes, result.mean, result.std, lowest, highest, result.success
         self.table.add(dict(zip(EVALUATION_COLUMNS, values, strict=True)))
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
-        self.tracker.show(stage.step, {**scalars, **stage.learner.images()})
+        for name, value in scalars.items():
+            self.trackers.record(name, value)
+        for name, picture in stage.learner.images().items():
+            self.trackers.record(name, Image(picture, "HWC"))
+        self.trackers.dump(stage.step)
         self.bar.show(evaluated=result.mean)
 
     def _on_training_start(self) -> None:
@@ -322,21 +300,6 @@ class EvaluationCallback(StageCallback):
     def _on_training_end(self) -> None:
         if self.is_missing:
             self._act()
-
-
-class FilmCallback(StageCallback):
-    """Films one episode on the first layout of the evaluations, into ``videos/``."""
-
-    def __init__(self, stage: Stage, tracker: Tracker) -> None:
-        super().__init__(stage, stage.config.video_every)
-        self.tracker = tracker
-
-    def _act(self) -> None:
-        stage, config = self.stage, self.stage.config
-        path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
-        (seed, _), deterministic = config.evaluation(stage.number), config.eval_deterministic
-        record_episode(config, stage.learner.trained_policy, deterministic, seed, record).save(path)
-        self.tracker.film(stage.step, path)
 
 
 class CheckpointCallback(StageCallback):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import time
 import zipfile
 from dataclasses import asdict, dataclass
 from io import BytesIO
@@ -118,12 +117,6 @@ class Checkpoint:
     def __init__(self, folder: Path) -> None:
         self.path = folder / "state.pt"
         self.archive = ReplayArchive(folder / "replay", 1)
-        self._before, self._start = 0.0, time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Wall time since this object was made, and of the sessions that led to the checkpoint that was read."""
-        return self._before + time.perf_counter() - self._start
 
     def save(self, learner: Learner, config: RunConfig, offset: int, evaluation_due: bool = False) -> None:
         """Replace the checkpoint; the next session begins with an evaluation if one is due.
@@ -140,7 +133,6 @@ class Checkpoint:
             "stage": learner.stage,
             "offset": offset,
             "num_timesteps": learner.num_timesteps,
-            "seconds": self.seconds,
             "evaluation_due": evaluation_due,
             "learner": learner.state_dict(),
         }
@@ -167,7 +159,6 @@ class Checkpoint:
             parse_json(state["config"])
             if min(state["stage"] - 1, state["offset"], state["num_timesteps"]) < 0:
                 raise ValueError("a count is negative")
-            self._before = float(state["seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise self.does_not_fit(error) from error
         return state

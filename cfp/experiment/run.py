@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +20,20 @@ from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
     CheckpointCallback,
     EvaluationCallback,
-    FilmCallback,
     LogCallback,
     ProgressBarCallback,
     ProgressTable,
     Stage,
     StopCallback,
-    Tracker,
-    check_trackers,
+    check_wandb,
+    make_trackers,
 )
 from cfp.experiment.checkpoint import Checkpoint, check_same
 from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import holds_progress, holds_run, policy_files, policy_path
 from cfp.files import read_json, write_atomically, write_json
 from cfp.learner import Learner
-from cfp.policy import copy_policy, is_of_another_task, read_policy
-from cfp.presets import like_start
+from cfp.policy import copy_policy, read_policy
 from cfp.tables import CSVTable
 from dittogym.render.frame import png
 
@@ -44,7 +41,7 @@ from dittogym.render.frame import png
 def check_options(config: RunConfig) -> None:
     """Check all that can be checked before anything is written."""
     config.check()
-    check_trackers(config)
+    check_wandb(config)
     for stage in range(1, len(config.ends()) + 1):
         make_env(config, config.action_size(stage), 1)
     if config.for_training() != config:
@@ -71,7 +68,6 @@ class TrainingRun:
             )
         self.learner, self.config, self.folder, self.signals = learner, config, folder, signals
         self.stages = len(config.ends())
-        self.seconds = 0.0  # wall time of all sessions, known after training
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         if resume and self.checkpoint.path.exists():
@@ -88,9 +84,10 @@ class TrainingRun:
         write_json(folder / "config.json", to_json(config))
         self._save_target()
         self.evaluations = CSVTable(folder / "evaluations.csv", self.step, ("step", "stage", "mean"))
-        self.tracker = Tracker(config, folder, self.step)
+        trackers = make_trackers(config, folder, self.step)
+        self.trackers = Logger(None, trackers)
         progress = ProgressTable(CSVTable(folder / "progress.csv", self.step))
-        self.logger = Logger(str(folder), [progress, *self.tracker.writers])
+        self.logger = Logger(str(folder), [progress, *trackers])
 
     def _save_target(self) -> None:
         """Show the target that the user has chosen as it is used."""
@@ -122,9 +119,6 @@ class TrainingRun:
         if total < min(self.step, past.get("steps", 0)):
             raise ConfigError(f"steps must be at least {self.step}, those that the run has taken, got {total}")
         print(f"resuming {folder} at step {self.step} of {total} (stage {self.stage})")
-        newest = policy_path(folder)
-        if newest.exists() and is_of_another_task(read_policy(newest)[1], config):
-            print(f"a file of task {config.task!r} has changed: evaluations from before it are of another task")
 
     def train(self) -> None:
         """Train the stages that are left."""
@@ -144,7 +138,6 @@ class TrainingRun:
         except NonFiniteError as error:
             raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
         finally:
-            self.seconds = self.checkpoint.seconds
             self.logger.close()
 
     def _create(self) -> Learner:
@@ -166,7 +159,7 @@ class TrainingRun:
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
         bar = ProgressBarCallback(stage)
-        evaluation = EvaluationCallback(stage, self.evaluations, self.tracker, bar, self.signals)
+        evaluation = EvaluationCallback(stage, self.evaluations, self.trackers, bar, self.signals)
         # A process killed after the last step but before the last evaluation still has to evaluate.
         if not stage.steps_left and not evaluation.is_missing:
             return
@@ -178,7 +171,6 @@ class TrainingRun:
                 evaluation,
                 CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
                 StopCallback(stage, self.signals),
-                FilmCallback(stage, self.tracker),  # which a stop need not wait for
             ]
         )
         try:
@@ -198,13 +190,7 @@ class TrainingRun:
             print(f"{best} has the highest mean return; its policy is {files[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
-        recording = None
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        preset = self.learner.preset(self.config.task, self.config.preset)
-        with suppress(CheckpointError, ConfigError):  # what it started from may be gone, or the hub's client be missing
-            start = {name: getattr(self.config, name, None) for name in ("start_from", "refine")}
-            preset = like_start(preset, start)
-        page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
-        print(f"all of it on one page: {page}")
+        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")

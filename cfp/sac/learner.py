@@ -1,31 +1,486 @@
-"""Soft actor-critic as the learner of a run, and ``cfp-sac``, with which the coarse-to-fine policy learns."""
+"""``cfp-sac``: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
+
+Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each tensor is
+clipped separately, the gate is penalised, and the random phase is independent of the start of the updates. Options of
+`cfp.config.LearningConfig` add what later publications found; the documentation explains them.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, ClassVar, cast, get_args
 
 import numpy as np
 import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from cfp.agent.actor import Actor, NetworkInput, upsample
 from cfp.config import Hyperparameters, Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
+from cfp.envs.vec_env import TorchVecEnv
+from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation.page import policy_pictures
 from cfp.learner import CoarseToFine, Learner, refines
 from cfp.presets import sac_preset
-from cfp.sac.algorithm import CFP
-from cfp.sac.policies import CFPPolicy, NetworkPolicy
+from cfp.sac.policies import CFPPolicy, NetworkPolicy, TwinCritic
+from cfp.sac.replay import Composition, ReplayRing
 
-#: Scalars logged beside ``cfp.sac.algorithm.METRICS`` and ``cfp.experiment.callbacks.LOG_METRICS``.
-ROLLOUT_METRICS: dict[str, str] = {
+#: Every scalar that it logs, and what it means.
+METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
     "rollout/length": "their mean length in environment steps",
     "rollout/success": "share of successes among them, where the task defines success",
     "rollout/episodes": "episodes finished in this stage",
+    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
+    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
+    "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
+    "train/q_target": "mean of the critics' regression target",
+    "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
+    "train/reward_mean": "running mean of rewards (of their sums over n_steps), which is subtracted before learning",
+    "train/reward_std": "running standard deviation of the same, by which they are divided",
+    "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
+    "train/gate_penalty": "gate penalty inside the actor loss",
+    "train/n_updates": "gradient updates so far in this stage",
+    "train/learning_rate": "learning rate of actor and critics",
 }
+#: Momentum of the running mean and variance of the rewards.
+REWARD_MOMENTUM = 0.99
+#: Largest gradient norm of each parameter tensor.
+MAX_GRAD_NORM = 10.0
+#: Of the zeta distribution of the number of steps for which exploration noise is held: exponent, and largest value.
+EXPONENT, LONGEST = 2.0, 16
+
+
+def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> Tensor:
+    """Scale the gradient of each parameter tensor separately to a norm of at most ``max_norm``; returns the norms."""
+    # The public torch.nn.utils.clip_grad_norm_, called for each tensor, takes ten times as long.
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = torch.stack(torch._foreach_norm(gradients))
+    torch._foreach_mul_(gradients, list((max_norm / (norms + 1e-6)).clamp(max=1.0).unbind()))
+    return norms
+
+
+class RewardStatistics(nn.Module):
+    """Running mean and variance of raw rewards, updated with each batch before it is normalised.
+
+    ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
+    ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
+
+    Where r is a sum over n steps, some sums end early, at the end of an episode or of the memory. Such a sum counts as
+    ``r / w`` in the statistics, and ``w M`` is subtracted from it, where w is the part of the discount factors that it
+    has; otherwise the mean of the missing rewards would be a penalty for the last states of an episode.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("variance", torch.ones(()))
+
+    @torch.no_grad()
+    def forward(self, rewards: Tensor, part: Tensor | float = 1.0) -> Tensor:
+        """Update the statistics with raw rewards of any shape and return them normalised; ``part`` is w."""
+        whole = rewards / part
+        self.mean.lerp_(whole.mean(), 1 - REWARD_MOMENTUM)
+        self.variance.lerp_(whole.var(), 1 - REWARD_MOMENTUM)
+        return (rewards - part * self.mean) / (self.variance.sqrt() + 1e-8)
+
+    def scalars(self) -> dict[str, Tensor]:
+        """Values to log."""
+        return {"reward_mean": self.mean, "reward_std": self.variance.sqrt()}
+
+
+def critic_target(
+    actor: Actor,
+    target: TwinCritic,
+    next_obs: NetworkInput,
+    rewards: Tensor,
+    not_done: Tensor,
+    alpha: Tensor | float,
+    gamma: Tensor | float,
+) -> Tensor:
+    """Target of the critics, ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
+
+    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit. Over n steps, r is their
+    discounted sum, and ``gamma`` its n-th power, (B, 1).
+    """
+    with torch.no_grad():
+        sample = actor.sample_for_critic(next_obs)
+        q_values = smaller_value(target, next_obs, sample.action)
+        return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
+
+
+def smaller_value(critic: TwinCritic, obs: NetworkInput, action: Tensor) -> Tensor:
+    """The smaller one of both critics' values, (B, 1)."""
+    return torch.minimum(*critic(obs, action))
+
+
+def critic_loss(critic: TwinCritic, obs: NetworkInput, actions: Tensor, target_q: Tensor) -> Tensor:
+    """Sum of both critics' mean squared errors for actions (B, 2, R, R) or (B, 2 R R)."""
+    return torch.stack([F.mse_loss(values, target_q) for values in critic(obs, actions)]).sum()
+
+
+def actor_loss(
+    actor: Actor,
+    critic: TwinCritic,
+    obs: NetworkInput,
+    alpha: Tensor,
+    gate_penalty: float,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Mean of ``alpha log pi - min Q`` plus ``gate_penalty`` times a residual actor's gate, and scalars to log."""
+    action, log_prob, gate, _ = actor.sample_for_critic(obs)
+    q_values = smaller_value(critic, obs, action)
+    loss = (alpha * log_prob[:, None] - q_values).mean()
+    scalars = {"q": q_values.detach().mean(), "entropy": -log_prob.detach().mean()}
+    if gate is not None:
+        penalty = gate_penalty * gate.flatten(1).norm(dim=1).mean() / actor.resolution
+        loss = loss + penalty
+        scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
+    return loss, scalars
+
+
+class CellNoise:
+    """Gaussian noise for actions (n, 2, R, R), equal in each of ``cells`` x ``cells`` blocks, and held for some steps.
+
+    Independent noise averages out over the body and over time. Noise that is held for a random number of steps is from
+    Dabney et al., "Temporally-extended epsilon-greedy exploration" (ICLR 2021), and is used so by FlashSAC (2026); pink
+    noise (Eberhard et al., ICLR 2023) is a relative. Another scale for each robot is from Ape-X (Horgan et al., ICLR
+    2018).
+
+    Args:
+        num_envs: n.
+        resolution: R.
+        cells: Blocks along each side; at most R.
+        scale: Standard deviations of the first and of the last robot; those between are spaced geometrically.
+        seed: Of the generator.
+    """
+
+    def __init__(
+        self, num_envs: int, resolution: int, cells: int, scale: tuple[float, float], seed: int | None
+    ) -> None:
+        if cells > resolution:
+            raise ConfigError(f"noise_cells must be at most {resolution}, the action grid, got {cells}")
+        self.block = resolution // cells
+        self.scale = np.geomspace(*scale, num_envs, dtype=np.float32)[:, None, None, None]
+        self.values = np.zeros((num_envs, 2, cells, cells), np.float32)
+        self.left = np.zeros(num_envs, np.int64)
+        self.generator = np.random.default_rng(seed)
+
+    def __call__(self) -> Tensor:
+        """The noise (n, 2, R, R) of the next step."""
+        due = np.flatnonzero(self.left == 0)
+        self.values[due] = self.generator.standard_normal((len(due), *self.values.shape[1:]), np.float32)
+        self.left[due] = np.minimum(self.generator.zipf(EXPONENT, len(due)), LONGEST)
+        self.left -= 1
+        blocks = (self.scale * self.values).repeat(self.block, axis=2).repeat(self.block, axis=3)
+        return torch.from_numpy(blocks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Noise, steps left, and state of the generator."""
+        generator = self.generator.bit_generator.state
+        return {"values": torch.from_numpy(self.values), "left": torch.from_numpy(self.left), "generator": generator}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        self.values, self.left = (state[name].numpy().copy() for name in ("values", "left"))
+        self.generator.bit_generator.state = state["generator"]
+
+
+class CFP(SAC):
+    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
+
+    In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
+    part only, as in the reference implementation. ``predict`` acts by the actor in training; see ``trained_actor``.
+
+    Args:
+        policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.NetworkPolicy``.
+        env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
+        hyperparameters: Hyperparameters of the stage.
+        sac_options: Further options of stable-baselines3's SAC, such as ``policy_kwargs``, ``seed`` and ``device``.
+
+    Raises:
+        TypeError: An option of stable-baselines3 is one of the hyperparameters, or belongs to CFP.
+        ConfigError: A hyperparameter is out of range.
+
+    Attributes:
+        average: The actor with averaged weights, see `restart_average`; None without ``weight_average``.
+        trains_encoder: Whether critics train an encoder that they share with the actor; False where a trained policy
+            is refined, which their first updates would change.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
+    reward_statistics: RewardStatistics
+    trains_encoder: bool = True
+
+    def __init__(
+        self,
+        policy: str | type[NetworkPolicy],
+        env: GymEnv | str,
+        hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
+        **sac_options: Any,
+    ) -> None:
+        hyperparameters.check()
+        self.hyperparameters = own = hyperparameters
+        spec = (sac_options.get("policy_kwargs") or {}).get("spec")
+        composition = Composition.of(spec) if spec else None
+        replay = {"seed": sac_options.get("seed"), "composition": composition, "n_steps": own.n_steps}
+        rate = own.learning_rate
+        super().__init__(
+            policy,
+            env,
+            rate if own.final_rate == 1 else LinearSchedule(rate, own.final_rate * rate, 1.0),
+            own.buffer_size,
+            own.update_start,
+            own.batch_size,
+            own.tau,
+            own.gamma,
+            gradient_steps=own.gradient_steps,
+            action_noise=None,  # the actor's own, and `CellNoise`
+            replay_buffer_class=ReplayRing,
+            replay_buffer_kwargs=replay | {"gamma": own.gamma},
+            ent_coef=own.alpha,
+            target_update_interval=1,
+            **sac_options,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        own = self.hyperparameters
+        self.reward_statistics = RewardStatistics().to(self.device)
+        self.noise = None
+        if own.noise_cells:
+            resolution = self.networks()[0].resolution
+            self.noise = CellNoise(self.n_envs, resolution, own.noise_cells, own.noise_scale, self.seed)
+        self.restart_average()
+
+    def restart_average(self) -> None:
+        """Let the average of the actor's weights begin with those it has now."""
+        decay, actor = self.hyperparameters.weight_average, self.networks()[0]
+        self.average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(decay)) if decay else None
+
+    @property
+    def trained_actor(self) -> Actor:
+        """The actor with averaged weights, or the one in training if there is no average."""
+        return self.networks()[0] if self.average is None else cast(Actor, self.average.module)
+
+    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
+        """Actor, critics and target critics."""
+        assert isinstance(self.policy, NetworkPolicy)
+        return self.policy.networks()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
+
+        Raises:
+            NonFiniteError: A loss is not finite; the optimiser step is not taken.
+        """
+        assert self.replay_buffer is not None
+        actor, critic, _ = self.networks()
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([actor.optimizer, critic.optimizer])
+        for _ in range(gradient_steps):
+            scalars = self.update(self.replay_buffer.sample(batch_size))
+            self._n_updates += 1
+            values = torch.stack(tuple(scalars.values())).tolist()  # waits for the device once, not for each scalar
+            for name, value in zip(scalars, values, strict=True):
+                self.logger.record_mean(f"train/{name}", value)
+        self.logger.record("train/n_updates", self._n_updates)
+
+    def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+        """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
+        assert isinstance(self.policy, NetworkPolicy)
+        actor, critic, target = self.networks()
+        obs = self.policy.encode(batch.observations)
+        if not self.trains_encoder:
+            obs = obs.detach()
+        with torch.no_grad():
+            next_obs = self.policy.encode(batch.next_observations)
+        gamma: Tensor | float = self.gamma
+        part: Tensor | float = 1.0
+        if batch.discounts is not None:  # rewards are sums over several steps, of which some end early
+            gamma = batch.discounts
+            part = (1 - gamma) / (1 - self.gamma**self.hyperparameters.n_steps)
+        rewards, not_done = self.reward_statistics(batch.rewards, part), 1 - batch.dones
+        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, gamma)
+        loss = critic_loss(critic, obs, batch.actions, target_q)
+        self._descend(loss, critic.optimizer, "critic")
+        scalars = {"critic_loss": loss.detach(), "q_target": target_q.mean()}
+        if self.num_timesteps >= self.hyperparameters.actor_start:
+            critic.requires_grad_(False)  # avoids weight gradients of the critics, which would be discarded
+            penalty = self.hyperparameters.gate_penalty
+            loss, of_actor = actor_loss(actor, critic, obs.detach(), self.ent_coef_tensor, penalty)
+            self._descend(loss, actor.optimizer, "actor")
+            critic.requires_grad_(True)
+            scalars |= of_actor | {"actor_loss": loss.detach()}
+        if self.average is not None:
+            self.average.update_parameters(actor)
+        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
+        return scalars | self.reward_statistics.scalars()
+
+    def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
+        optimizer.zero_grad()
+        loss.backward()
+        norms = clip_each(optimizer.param_groups[0]["params"], MAX_GRAD_NORM)
+        if not (torch.isfinite(loss) and torch.isfinite(norms).all()):
+            raise NonFiniteError(
+                f"the {name} loss {loss.item()} or its gradient is not finite at update {self._n_updates + 1} "
+                f"({self.num_timesteps} environment steps into the stage)"
+            )
+        optimizer.step()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions to execute, and their form in the replay buffer."""
+        assert isinstance(self.replay_buffer, ReplayRing)
+        composition = self.replay_buffer.composition
+        random_steps = self.hyperparameters.random_steps
+        if self.num_timesteps < random_steps:
+            # stable-baselines3 ends its random phase where updates start; here the two are independent.
+            return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
+        if composition is not None or self.noise is not None:
+            actions, stored = self._act(composition)
+        else:
+            actions, stored = super()._sample_action(0, action_noise, n_envs)
+        self._check_finite("action", actions)
+        return actions, stored
+
+    def _on_action_grid(
+        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Coarsen uniform actions to the action grid of the stage; independent pixels of a patch would average out."""
+        if not isinstance(self.policy, CFPPolicy):
+            return actions, stored
+        grid, size = self.networks()[0].resolution, self.policy.spec.action_size
+        if grid == size:
+            return actions, stored
+        corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
+        actions = upsample(corner, size, self.policy.spec.interpolation).numpy()
+        return actions, actions if composition is None else composition.from_finest(corner).numpy()
+
+    @torch.no_grad()
+    def _act(self, composition: Composition | None) -> tuple[np.ndarray, np.ndarray]:
+        """Act as ``predict`` does, with exploration noise, and keep the parts of the actions."""
+        assert self._last_obs is not None
+        self.policy.set_training_mode(False)
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        assert isinstance(observation, Tensor)
+        actor = self.networks()[0]
+        outputs = actor.outputs(observation)
+        if self.noise is not None:
+            outputs = outputs._replace(mean=outputs.mean + self.noise().to(outputs.mean.device))
+        sample = actor.act(outputs)
+        action = sample.action.cpu().numpy()
+        return action, action if composition is None else composition.join(sample.parts).cpu().numpy()
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._check_finite("reward", reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, name: str, values: np.ndarray) -> None:
+        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if not finite.all():
+            raise NonFiniteError(
+                f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
+                "the stage; nothing of this step was stored"
+            )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()
+        return [*modules, "reward_statistics", *(["average"] if self.average else [])], tensors
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "reward_statistics", "noise", "average"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that it learns and counts but ``num_timesteps`` and the replay buffer, as tensors and plain values."""
+        values = self.logger.name_to_value  # of the row that comes next
+        monitor, env = self._environments()
+        generators: dict[str, Any] = {"torch": torch.get_rng_state()} | {
+            name: generator.bit_generator.state for name, generator in self._generators().items()
+        }
+        if self.device.type == "cuda":
+            generators["cuda"] = torch.cuda.get_rng_state(self.device)
+        return {name: part.state_dict() for name, part in self._parts().items()} | {
+            "episodes": self._episode_num,
+            "updates": self._n_updates,
+            "recent": [{key: float(value) for key, value in info.items()} for info in self.ep_info_buffer or ()],
+            "successes": [bool(success) for success in self.ep_success_buffer or ()],
+            "means": {name: (values[name], count) for name, count in self.logger.name_to_count.items()},
+            "environment": {  # the episodes in progress
+                "episodes": env.state_dict(),
+                "generators": env.torch_env.generators,
+                "returns": torch.from_numpy(monitor.episode_returns.copy()),
+                "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
+                "observation": torch.from_numpy(np.array(self._last_obs)),
+            },
+            "random": generators,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the ``state`` of `state_dict`."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self._episode_num, self._n_updates = state["episodes"], state["updates"]
+        self.ep_info_buffer = deque(state["recent"], maxlen=self._stats_window_size)
+        self.ep_success_buffer = deque(state["successes"], maxlen=self._stats_window_size)
+        for name, (mean, count) in state["means"].items():
+            self.logger.record_mean(name, mean)
+            self.logger.name_to_count[name] = count
+        monitor, env = self._environments()
+        monitor.reset()  # so that later episodes start as they would have
+        episodes, generators = state["environment"], state["random"]
+        env.load_state_dict(episodes["episodes"])
+        env.torch_env.generators = episodes["generators"]
+        monitor.episode_returns = episodes["returns"].numpy().copy()
+        monitor.episode_lengths = episodes["lengths"].numpy().copy()
+        self._last_obs = episodes["observation"].numpy().copy()
+        torch.set_rng_state(generators["torch"])
+        for name, generator in self._generators().items():
+            generator.bit_generator.state = generators[name]
+        if "cuda" in generators and self.device.type == "cuda":
+            torch.cuda.set_rng_state(generators["cuda"], self.device)
+
+    def _parts(self) -> dict[str, Any]:
+        """What has a state of its own."""
+        actor, critic, _ = self.networks()
+        optimizers = {"actor_optimizer": actor.optimizer, "critic_optimizer": critic.optimizer}
+        parts = {"policy": self.policy, "reward_statistics": self.reward_statistics, **optimizers}
+        optional = {"noise": self.noise, "average": self.average}
+        return parts | {name: part for name, part in optional.items() if part is not None}
+
+    def _environments(self) -> tuple[VecMonitor, TorchVecEnv]:
+        monitor = self.get_env()
+        assert isinstance(monitor, VecMonitor) and isinstance(monitor.venv, TorchVecEnv)
+        return monitor, monitor.venv
+
+    def _generators(self) -> dict[str, np.random.Generator]:
+        """Those that training draws from, beside torch's: the replay memory's, and the action space's."""
+        assert isinstance(self.replay_buffer, ReplayRing)
+        return {"replay": self.replay_buffer.generator, "actions": self.action_space.np_random}
 
 
 class SACLearner(CFP, Learner):

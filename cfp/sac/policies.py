@@ -1,24 +1,119 @@
-"""The networks as a policy of stable-baselines3: actor, twin critics and target critics."""
+"""The networks as a policy of stable-baselines3: actor, twin critics and target critics, and the critics themselves."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import Any, cast
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
 from torch import Tensor, nn
 
-from cfp.agent.actor import Actor, ActorSpec, Encoded, NetworkInput, SquashedActor, build_actor, halved, normalise_image
-from cfp.agent.critics import SmallCritics, TwinCritic
+from cfp.agent.actor import (
+    IMAGE_SIZE,
+    LATENT,
+    SMALL_WIDTH,
+    ActionEncoder,
+    Actor,
+    ActorSpec,
+    Encoded,
+    Interpolation,
+    NetworkInput,
+    PairEncoder,
+    SquashedActor,
+    build_actor,
+    encode,
+    halved,
+    initialise,
+    normalise_image,
+    perceptron,
+    upsample,
+)
 from cfp.policy import check_images
 
 
+class PaperCritic(nn.Module):
+    """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
+
+    def __init__(self, split: bool) -> None:
+        super().__init__()
+        self.encoder = PairEncoder(split)
+        self.value = perceptron(LATENT, 256, 256, 1)
+        initialise(self)
+
+
+class TwinCritic(nn.Module):
+    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor."""
+
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
+        super().__init__()
+        self.resolution, self.interpolation = resolution, interpolation
+        self.critics = nn.ModuleList(PaperCritic(split) for _ in range(2))
+
+    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        """Values (B, 1) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
+        image = normalise_image(observation)
+        patch = upsample(action.reshape(-1, 2, self.resolution, self.resolution), IMAGE_SIZE, self.interpolation)
+        critics = cast(list[PaperCritic], list(self.critics))
+        encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
+        inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
+        parts = [encode(pair, *seen).unflatten(1, (2, -1)) for pair, seen in zip(encoders, inputs, strict=True)]
+        latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
+        return _values([critic.value for critic in critics], latents)
+
+
+class SmallCritics(nn.Module):
+    """Two critics of actions (2, R, R) on the features of the encoder that they share with the actor.
+
+    Layers are normalised, which bounds the values of actions that were never tried (Ball et al., "Efficient Online
+    Reinforcement Learning with Offline Data", ICML 2023).
+
+    Args:
+        resolution: Action grid R of the actor.
+    """
+
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, resolution: int) -> None:
+        super().__init__()
+        self.actions = ActionEncoder(resolution, 2 * SMALL_WIDTH)  # half of the channels for each critic
+        self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, 1, norm=True) for _ in range(2))
+        initialise(self)
+
+    def forward(self, observation: Encoded, action: Tensor) -> tuple[Tensor, ...]:
+        """Values (B, 1) of both critics for encoded observations and actions (B, 2, R, R) or (B, 2 R R), or larger."""
+        size = math.isqrt(action[0].numel() // 2)
+        features = self.actions(action.reshape(-1, 2, size, size))
+        latents = torch.stack([torch.cat([observation.features, part], dim=1) for part in features.chunk(2, dim=1)])
+        return _values(self.heads, latents)
+
+
+def _values(perceptrons: Iterable[nn.Module], latents: Tensor) -> tuple[Tensor, ...]:
+    """Evaluate perceptrons, each on its own latents (n, B, ...); returns (B, 1) each.
+
+    One product a layer for all of them makes a training with the paper's networks a twentieth faster on a CPU.
+    """
+    values = latents.flatten(2)
+    for layers in zip(*(network.children() for network in perceptrons), strict=True):
+        if isinstance(layers[0], nn.Linear):
+            weight = torch.stack([layer.weight for layer in layers])
+            bias = torch.stack([layer.bias for layer in layers])
+            values = torch.baddbmm(bias[:, None], values, weight.transpose(1, 2))
+        elif not isinstance(layers[0], nn.Flatten):
+            values = layers[0](values)  # it has no weights
+    return tuple(values)
+
+
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
-    """Base class of the policies that `cfp.sac.algorithm.CFP` trains; subclasses create actor and critics.
+    """Base class of the policies that `cfp.CFP` trains; subclasses create actor and critics.
 
     Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
     """

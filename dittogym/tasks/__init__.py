@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
@@ -43,17 +41,6 @@ def headline(task: str) -> tuple[str, str]:
         return name, ""
     title, _, goal = (inspect.getdoc(inspect.getmodule(TASKS[name])) or "").partition(": ")
     return title, goal[:1].upper() + goal[1:]
-
-
-def fingerprint(task: str) -> str | None:
-    """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file."""
-    try:
-        file = Path(inspect.getsourcefile(TASKS[task_name(task)]) or "")
-    except TypeError:  # no plain function
-        return None
-    if not file.is_file() or file.parent == Path(__file__).parent:
-        return None
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def check_task(task: object) -> None:

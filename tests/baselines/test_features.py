@@ -8,7 +8,7 @@ import torch
 
 from baselines import Shac
 from cfp.analytic.critic import CELLS, StateFeatures
-from cfp.analytic.reward import RADIUS, TOLERANCE, Neighbours, training_reward
+from cfp.analytic.window import RADIUS, TOLERANCE, Neighbours, training_reward
 from dittogym import TorchEnv
 
 

@@ -41,19 +41,6 @@ def test_log_prob_is_that_of_a_squashed_gaussian():
     assert gate is None
 
 
-def test_small_actions_have_the_exact_log_prob():
-    torch.manual_seed(1)
-    actor = build_actor(ActorSpec((16,))).double()
-    image = normalise_image(images()).double()
-    action, log_prob, *_ = actor.sample(image)
-    latent = actor.encoder(image)
-    std = F.softplus(3 * actor.std(latent) - 1).clamp(0.1, 6)
-    squashed = distributions.TransformedDistribution(
-        distributions.Normal(actor.mean(latent), std), distributions.TanhTransform()
-    )
-    torch.testing.assert_close(log_prob, squashed.log_prob(action).flatten(1).sum(1), rtol=1e-5, atol=1e-3)
-
-
 @pytest.mark.parametrize(("split", "scale"), [(False, 1.0), (True, 0.25)])
 @pytest.mark.parametrize("interpolation", ["half_pixel", "aligned"])
 def test_gate_blends_residual_and_coarse(split, scale, interpolation):

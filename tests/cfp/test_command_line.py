@@ -16,10 +16,9 @@ import torch
 import baselines.train
 from cfp import registry, train
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.page import command_words
 from cfp.experiment.cli import Stopped, program_name, run_command
-from cfp.experiment.training import parse
-from cfp.presets import like_start, sac_preset
+from cfp.presets import sac_preset
+from cfp.train import parse
 
 TINY = "--learner sac --particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
 
@@ -83,24 +82,6 @@ def test_help_names_the_program_that_was_started(monkeypatch, capsys):
         train.main()
     assert "python pit.py --help" in " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert program_name("cfp.train", []) == "python -m cfp.train"
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--task run --steps 16000 --handover 0.6",
-        "--task kick --learner sac --steps 19200 --critics-first 0.1 --no-video",
-        "--task run --learner sac --start-from run --batch-size 128",
-        "--task run --start-from run --refine --action-step 0.05 --resolutions 8 --seed 3",
-        "--algo gnn-16 --task run --steps 19200",
-    ],
-)
-def test_the_command_that_repeats_a_run(words):
-    """Some options follow from others; they are named where they do not."""
-    config = parse(words.split()).run
-    preset = registry.find(config.algo).preset(config.task, config.preset)
-    start = {name: getattr(config, name, None) for name in ("start_from", "refine")}
-    assert parse(command_words(config, like_start(preset, start))[2:]).run == config
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from policy_files import save_actor
@@ -95,16 +94,13 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"steps": "x"}, "steps must be of type int, got 'x'"),
-        ({"steps": 1.5}, "steps must be of type int"),
-        ({"steps": None}, "steps must be of type int"),
+        ({"steps": 1.5}, "steps must be of type int, got 1.5"),
         ({"steps": True}, "steps must be of type int"),
         ({"video": 1}, "video must be of type bool"),
         ({"tau": "0.5"}, "tau must be of type float"),
         ({"dtype": "float16"}, r"dtype must be of type Literal\['float32', 'float64'\]"),
         ({"particles": [1.5, 2]}, "particles must be of type"),
         ({"alpha": [0.1, "x"]}, r"alpha must be of type tuple\[float, ...\]"),
-        ({"alpha": [0.1, True]}, "alpha must be of type"),
         ({"resolutions": 8}, "resolutions must be of type"),
         ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
         ({"target": 3}, "target must be of type str | None"),
@@ -222,18 +218,6 @@ def test_a_step_keeps_its_duration_with_other_substeps():
     config = configure({"task": "run", "train_particles": 500, "train_dt": 2e-4})
     trained = config.for_training().environment
     assert trained == replace(config.environment, particles=500, dt=2e-4, substeps=50)
-
-
-def test_layout_of_actions_can_be_chosen():
-    def field(**values):
-        env = make_env(sac(particles=100, substeps=1, **values), 2, 1)
-        env.reset()
-        env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
-        pull = env.venv.torch_env._actuation[0, 0]
-        return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
-
-    image, grid = field(), field(action_layout="grid")
-    assert image[0] > grid[0] and image[1] == grid[1]  # both above the middle, one right of it and one left
 
 
 def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_without_noise_of_cells():

@@ -9,11 +9,10 @@ from cfp.agent.actor import (
     PairEncoder,
     build_actor,
     decode,
-    halved,
     make_head,
     upsample,
 )
-from cfp.agent.critics import SmallCritics, TwinCritic
+from cfp.sac.policies import SmallCritics, TwinCritic
 
 
 def trainable(module):
@@ -109,8 +108,8 @@ def test_twin_critics_equal_each_on_its_own(split):
 
 def test_small_critics_equal_each_on_its_own():
     actor, critics = build_actor(ActorSpec((8,), encoder="small")).double(), SmallCritics(8).double()
-    image, action = leaf(2, 3, 64, 64), leaf(2, 2, 8, 8)
-    seen = Encoded(halved(image), actor.encoder(image))
+    image, action = leaf(2, 3, 32, 32), leaf(2, 2, 8, 8)
+    seen = Encoded(image, actor.encoder(image))
     parts = critics.actions(action).chunk(2, dim=1)
     plain = [head(torch.cat([seen.features, part], 1)) for head, part in zip(critics.heads, parts, strict=True)]
     assert_same_values_and_gradients(critics, [action], critics(seen, action), plain)

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import safetensors
 import torch
-from PIL import Image, ImageDraw
 from policy_files import describe_actor, save_actor
 
 import cfp
 from cfp.agent.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.policy import check_trained_for, describe_run, is_of_another_task, policy_file, write_policy
+from cfp.policy import check_trained_for, policy_file, write_policy
 from cfp.presets import sac_preset
 from cfp.sac.policies import CFPPolicy
 from dittogym.action import trained_layout
@@ -162,23 +161,6 @@ def test_file_of_a_policy_may_be_named_without_its_suffix(tmp_path):
         assert policy_file(tmp_path / name) == tmp_path / f"{expected}.safetensors"
     with pytest.raises(CheckpointError, match=r"p\.backup\.safetensors: there is no policy"):
         policy_file(tmp_path / "p.backup")
-
-
-def test_a_changed_target_picture_is_another_task(tmp_path):
-    picture = tmp_path / "target.png"
-
-    def draw(shape):
-        image = Image.new("L", (64, 64), 255)
-        getattr(ImageDraw.Draw(image), shape)((20, 20, 44, 44), fill=0)
-        image.save(picture)
-
-    draw("ellipse")
-    config = sac_preset("shapematch", "quick")
-    config = replace(config, target=str(picture))
-    description = describe_run(config, "cfp", 1, 10)
-    assert not is_of_another_task(description, config)
-    draw("rectangle")
-    assert is_of_another_task(description, config)
 
 
 def test_the_policy_of_an_actor_is_a_copy_made_without_random_numbers():

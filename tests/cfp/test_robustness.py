@@ -14,7 +14,7 @@ from scipy import stats
 from cfp import robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
-from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, reason_without_effect
+from cfp.envs.disturbances import Case, Disturbed, changes_something, disturbed_env, make_cases
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
@@ -99,7 +99,7 @@ def test_constants_reach_the_physics_of_every_task(task):
 
 def test_cases_that_change_nothing_in_a_task_are_left_out():
     cases = make_cases()
-    names = {task: [case.name for case in cases if not reason_without_effect(case, make_spec(task))] for task in TASKS}
+    names = {task: [case.name for case in cases if changes_something(case, make_spec(task))] for task in TASKS}
     assert "gravity x 0.8" in names["run"] and "gravity x 0.8" not in names["shapematch"]
     assert "floor friction sticky" in names["dig"] and "floor friction 0" not in names["dig"]
     assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
@@ -115,7 +115,7 @@ def test_interval_is_student_s():
 @pytest.fixture
 def folder(tmp_path):
     config = sac_preset("shapematch")
-    config = replace(config, particles=1000, substeps=10)
+    config = replace(config, particles=1000, substeps=2)
     write_json(tmp_path / "config.json", to_json(config))
     torch.manual_seed(0)  # of a policy with a positive return, which ratios refer to
     save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
@@ -123,12 +123,12 @@ def folder(tmp_path):
 
 
 def test_command_writes_table_and_plot(folder, capsys):
-    arguments = [str(folder), "--episodes", "2", "--device", "cpu"]
+    arguments = [str(folder), "--episodes", "1", "--device", "cpu"]
     assert robustness.main(arguments) == 0
     printed = capsys.readouterr().out
     rows = json.loads((folder / "robustness.json").read_text())
     assert [row["case"] for row in rows] == [
-        case.name for case in make_cases() if not reason_without_effect(case, make_spec("shapematch"))
+        case.name for case in make_cases() if changes_something(case, make_spec("shapematch"))
     ]
     assert rows[0]["ratio"] == 1
     for row in rows:
@@ -141,8 +141,8 @@ def test_command_writes_table_and_plot(folder, capsys):
     assert table in printed and all(f"| {row['case']} |" in table for row in rows)
     assert (folder / "robustness.png").read_bytes().startswith(b"\x89PNG")
     config, policies = open_run(folder, "cpu")
-    again = robustness.report(config, policies["stage 2"], make_cases()[:4], 2)  # alone, with the same seed
-    assert robustness.to_rows(again) == rows[:4]
+    again = robustness.report(config, policies["stage 2"], make_cases()[:3], 1)  # alone, with the same seed
+    assert robustness.to_rows(again) == rows[:3]
 
 
 def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder, tmp_path, capsys):
@@ -170,12 +170,12 @@ def test_cases_are_chosen_by_words(folder):
     assert [case.name for case in chosen] == names + [f"floor friction {value}" for value in (0, 0.5, "sticky")]
     assert robustness.choose(cases, [], run, policy) == cases
     ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
-    with pytest.raises(ConfigError, match="friction 0: run has no obstacle"):
+    with pytest.raises(ConfigError, match="got 'friction'"):
         robustness.choose(cases, ["friction"], replace(run, obstacles=tuple(ground)), policy)
-    with pytest.raises(ConfigError, match="sticky"):
+    with pytest.raises(ConfigError, match="got 'sticky'"):
         robustness.choose(cases, ["sticky"], run, policy)
     policy.uses_image = False
-    with pytest.raises(ConfigError, match="observation"):
+    with pytest.raises(ConfigError, match="got 'observation'"):
         robustness.choose(cases, ["observation"], run, policy)
 
 

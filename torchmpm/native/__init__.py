@@ -1,4 +1,4 @@
-"""The substep as fused kernels: in C++ on the CPU (``cpu``) and in Triton on CUDA (``cuda``).
+"""The substep as fused kernels: in C++ on the CPU (``cpu``) and in CUDA C++ on a GPU (``cuda``).
 
 ``kernels`` is what the solver calls, with its adjoint, ``tables`` describes a solver to the kernels, and ``library``
 compiles and loads C++. All kernels use the names of ``torchmpm.materials`` and ``torchmpm.transfer``.

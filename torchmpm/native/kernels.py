@@ -2,9 +2,6 @@
 
 import ctypes
 import functools
-import importlib.util
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,6 +15,8 @@ from torchmpm.boundary import VelocityRule
 from torchmpm.checks import Segment
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
+from torchmpm.native.cuda.compiler import unavailable
+from torchmpm.native.cuda.launcher import CUDA
 from torchmpm.native.library import POOL, load, thread_pool
 from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
 from torchmpm.state import ParticleState
@@ -30,8 +29,8 @@ MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: backward pass. It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps
 #: are cut. Simulations that run at the same time share it.
 KEPT_BYTES = 2**28
-#: The tape on CUDA takes no more than this, bytes.
-CUDA_TAPE_BYTES = 2**31
+#: Share of a GPU's memory that the tape of one simulation may take; as many at once as fit have one.
+CUDA_TAPE_SHARE = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +49,11 @@ class Kernels:
         if device.type not in ("cpu", "cuda"):
             return f"its kernels run on the CPU and on CUDA, the state is on {device}"
         if device.type == "cuda":
-            missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
+            missing = unavailable(device)
             if missing is not None:
                 return missing
-            if torch.get_deterministic_debug_mode() == 2:  # not allowed, rather than warned of
-                return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
+            if torch.get_deterministic_debug_mode() == 2 and torch.is_grad_enabled():  # not allowed, or warned of
+                return "gradients on CUDA add in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
         return self._unsupported
 
     @functools.cached_property
@@ -115,23 +114,14 @@ class Kernels:
 
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
+        rows, batch, particles = components.shape
+        substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
         if components.is_cuda:
-            limit = CUDA_TAPE_BYTES // (components.element_size() * components.numel())
+            memory = torch.cuda.get_device_properties(components.device).total_memory
+            limit = int(CUDA_TAPE_SHARE * memory) // substep
         else:
-            rows, batch, particles = components.shape
-            substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
             limit = KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
-
-
-@functools.cache
-def triton_missing(compiler: str | None, path: str | None) -> str | None:
-    """Why Triton cannot work, or ``None`` if it can, with $CC and $PATH as given."""
-    if importlib.util.find_spec("triton") is None:
-        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
-    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
-        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
-    return None
 
 
 class Step(torch.autograd.Function):
@@ -183,9 +173,7 @@ adjoint.register_autograd(_no_second_derivative)
 def forward(inputs: Inputs, tables: Tables, substeps: int) -> Tensor:
     """Components (13, B, N) after some substeps."""
     if inputs.components.is_cuda:
-        from torchmpm.native import cuda  # not at the top: it imports Triton
-
-        return cuda.forward(inputs, tables, substeps)
+        return CUDA.forward(inputs, tables, substeps)
     result = torch.empty_like(inputs.components)
     call("torchmpm_forward", inputs, tables, substeps, result=result)
     return result
@@ -196,9 +184,7 @@ def backward(
 ) -> tuple[Tensor, ...]:
     """Replay the substeps, then go back; derivatives as :meth:`Inputs.empty_cotangents` lists them."""
     if inputs.components.is_cuda:
-        from torchmpm.native import cuda
-
-        return cuda.backward(inputs, tables, substeps, wants_field, wants_values)
+        return CUDA.backward(inputs, tables, substeps, wants_field, wants_values)
     bars = inputs.empty_cotangents(wants_field, wants_values)
     wanted = {name: bar for name, bar in zip(COTANGENTS, bars, strict=True) if bar.numel()}
     call("torchmpm_backward", inputs, tables, substeps, **wanted)

@@ -21,8 +21,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-#: Headers that all libraries may include.
+#: Headers that all libraries may include, and those for CPU and GPU that these include.
 HEADERS = Path(__file__).resolve().parent / "cpu"
+COMMON = HEADERS.parent / "common"
 #: The physics, and the option of each dtype by its name.
 NATIVE = HEADERS / "native.cpp"
 REAL = {"float32": "-DTORCHMPM_REAL=float", "float64": "-DTORCHMPM_REAL=double"}
@@ -76,7 +77,7 @@ def arguments(source: Path, options: Sequence[str], processor: str) -> list[str]
 def digest_of(source: Path, *facts: str) -> str:
     """Hash of the sources beside a file, the headers and some facts."""
     digest = hashlib.sha256("\n".join(facts).encode())
-    for file in sorted(file for place in {source.resolve().parent, HEADERS} for file in place.glob("*.[ch]pp")):
+    for file in sorted(file for place in {source.resolve().parent, HEADERS, COMMON} for file in place.glob("*.[ch]pp")):
         digest.update(file.read_bytes())
     return digest.hexdigest()
 

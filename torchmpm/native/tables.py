@@ -130,9 +130,8 @@ def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
 
 @cached_tensors
 def upload(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers as a tensor; does not wait for the device."""
-    host = torch.tensor(numbers, dtype=dtype, device="cpu")
-    return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
+    """Numbers as a tensor, which is kept; steps on any stream of the device may use it."""
+    return torch.tensor(numbers, dtype=dtype, device=device)
 
 
 def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Tensor:

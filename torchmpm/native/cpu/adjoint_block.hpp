@@ -1,6 +1,6 @@
 // Adjoint of what a block of particles does in a substep.
 #pragma once
-#include "material_adjoint.hpp"
+#include "../common/particle_adjoint.hpp"
 #include "step.hpp"
 
 // Two numbers of each of the nine nodes around a block's particles; node (p, q) is number 3 p + q.
@@ -58,24 +58,13 @@ struct alignas(64) Momentum {
         const Real h = scene.h;
 #pragma omp simd
         for (int k = 0; k < LANES; ++k) {
-            Real v[2] = {0, 0}, slope_x[2] = {0, 0}, slope_y[2] = {0, 0};
-            three([&](int p) {
-                Real across[2] = {0, 0}, tilt[2] = {0, 0};
-                three([&](int q) {
-                    const Real w = at.wy[q][k], d = w * (q - at.fy[k]);
-                    for (int c = 0; c < 2; ++c) {
-                        across[c] += w * p_bar.v[3 * p + q][c][k];
-                        tilt[c] += d * p_bar.v[3 * p + q][c][k];
-                    }
-                });
-                const Real w = at.wx[p][k], d = w * (p - at.fx[k]);
-                for (int c = 0; c < 2; ++c) {
-                    v[c] += w * across[c], slope_x[c] += d * across[c], slope_y[c] += w * tilt[c];
-                }
-            });
-            v_bar[0][k] = v[0], v_bar[1][k] = v[1];
-            affine_bar[0][k] = h * slope_x[0], affine_bar[1][k] = h * slope_y[0];
-            affine_bar[2][k] = h * slope_x[1], affine_bar[3][k] = h * slope_y[1];
+            const Moments m = gather(
+                at.fx[k], at.fy[k], [&](int p) INLINE_LAMBDA { return at.wx[p][k]; },
+                [&](int q) INLINE_LAMBDA { return at.wy[q][k]; },
+                [&](int p, int q, int c) INLINE_LAMBDA { return p_bar.v[3 * p + q][c][k]; });
+            v_bar[0][k] = m.value[0], v_bar[1][k] = m.value[1];
+            affine_bar[0][k] = h * m.slope_x[0], affine_bar[1][k] = h * m.slope_y[0];
+            affine_bar[2][k] = h * m.slope_x[1], affine_bar[3][k] = h * m.slope_y[1];
         }
     }
 };
@@ -85,38 +74,33 @@ struct alignas(64) Momentum {
 template <Kind kind, bool wants_values>
 INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k,
                                const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
-    const Mat2 C = matrix(state, C0, k), F = matrix(state, F0, k), grown = growth(dt, C), trial = matmul(grown, F);
+    const Mat2 C = matrix(state, C0, k), old_F_bar = matrix(bar, F0, k);
     const Mat2 P_bar{momentum.affine_bar[0][k], momentum.affine_bar[1][k], momentum.affine_bar[2][k],
                      momentum.affine_bar[3][k]};
     const Real old_Jp_bar = bar.v[JP][k];
-    const Mat2 old_F_bar = matrix(bar, F0, k);
-    Mat2 F_bar = old_F_bar;
-    Real Jp_bar = old_Jp_bar;
-    Sym2 S;
-    const MaterialBar out = material_adjoint<kind>(m, bounds, trial, state.v[JP][k], act_x, act_y,
-                                                   {P_bar.a, P_bar.b + P_bar.c, P_bar.d}, F_bar, Jp_bar, S);
-    const Mat2 C_bar = m.mass * P_bar + dt * matmul(F_bar, transposed(F));
-    F_bar = matmul(transposed(grown), F_bar);
+    const DeformedBar out = deform_adjoint<kind>(dt, m, bounds, C, matrix(state, F0, k), state.v[JP][k], act_x, act_y,
+                                                 P_bar, old_F_bar, old_Jp_bar);
     momentum.mass[k] = m.mass;
-    momentum.affine[0][k] = S.xx + m.mass * C.a, momentum.affine[1][k] = S.xy + m.mass * C.b;
-    momentum.affine[2][k] = S.xy + m.mass * C.c, momentum.affine[3][k] = S.yy + m.mass * C.d;
-    momentum.C_bar[0][k] = C_bar.a, momentum.C_bar[1][k] = C_bar.b;
-    momentum.C_bar[2][k] = C_bar.c, momentum.C_bar[3][k] = C_bar.d;
-    momentum.act_bar[0][k] = on ? out.act_x : 0, momentum.act_bar[1][k] = on ? out.act_y : 0;
-    bar.v[F0][k] = on ? F_bar.a : old_F_bar.a, bar.v[F1][k] = on ? F_bar.b : old_F_bar.b;
-    bar.v[F2][k] = on ? F_bar.c : old_F_bar.c, bar.v[F3][k] = on ? F_bar.d : old_F_bar.d;
-    if (kind == Kind::snow) bar.v[JP][k] = on ? Jp_bar : old_Jp_bar;
+    momentum.affine[0][k] = out.affine.a, momentum.affine[1][k] = out.affine.b;
+    momentum.affine[2][k] = out.affine.c, momentum.affine[3][k] = out.affine.d;
+    momentum.C_bar[0][k] = out.C.a, momentum.C_bar[1][k] = out.C.b;
+    momentum.C_bar[2][k] = out.C.c, momentum.C_bar[3][k] = out.C.d;
+    momentum.act_bar[0][k] = on ? out.material.act_x : 0, momentum.act_bar[1][k] = on ? out.material.act_y : 0;
+    bar.v[F0][k] = on ? out.F.a : old_F_bar.a, bar.v[F1][k] = on ? out.F.b : old_F_bar.b;
+    bar.v[F2][k] = on ? out.F.c : old_F_bar.c, bar.v[F3][k] = on ? out.F.d : old_F_bar.d;
+    if (kind == Kind::snow) bar.v[JP][k] = on ? out.Jp : old_Jp_bar;
     if (!wants_values) return;
     const Real mass_bar = state.v[VX][k] * momentum.v_bar[0][k] + state.v[VY][k] * momentum.v_bar[1][k] +
                           P_bar.a * C.a + P_bar.b * C.b + P_bar.c * C.c + P_bar.d * C.d;
+    const Values& of = out.material.values;
     values_bar[k] += on ? mass_bar : 0;
-    values_bar[LANES + k] += on ? out.values.factor : 0;
-    values_bar[2 * LANES + k] += on ? out.values.mu2 : 0;
-    values_bar[3 * LANES + k] += on ? out.values.lam : 0;
-    values_bar[4 * LANES + k] += on ? out.values.tanh2 : 0;
-    values_bar[5 * LANES + k] += on ? out.values.exp : 0;
-    values_bar[6 * LANES + k] += on ? out.values.cosh2 : 0;
-    values_bar[7 * LANES + k] += on ? out.values.sinh2 : 0;
+    values_bar[LANES + k] += on ? of.factor : 0;
+    values_bar[2 * LANES + k] += on ? of.mu2 : 0;
+    values_bar[3 * LANES + k] += on ? of.lam : 0;
+    values_bar[4 * LANES + k] += on ? of.tanh2 : 0;
+    values_bar[5 * LANES + k] += on ? of.exp : 0;
+    values_bar[6 * LANES + k] += on ? of.cosh2 : 0;
+    values_bar[7 * LANES + k] += on ? of.sinh2 : 0;
 }
 
 template <Kind kind, bool varying, bool wants_values>
@@ -156,54 +140,39 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
     const Real dt = scene.dt, h = scene.h, inverse_h = scene.inverse_h;
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
-        const Real fx = at.fx[k], fy = at.fy[k], mass = momentum.mass[k];
-        const Real vx_bar = bar.v[VX][k] + dt * bar.v[X][k], vy_bar = bar.v[VY][k] + dt * bar.v[Y][k];
-        const Real mvx = mass * state.v[VX][k], mvy = mass * state.v[VY][k];
-        const Real scale = 4 * inverse_h;
-        const Real cxx = scale * bar.v[C0][k], cxy = scale * bar.v[C1][k];
-        const Real cyx = scale * bar.v[C2][k], cyy = scale * bar.v[C3][k];
-        const Real pxx = h * momentum.affine[0][k], pxy = h * momentum.affine[1][k];
-        const Real pyx = h * momentum.affine[2][k], pyy = h * momentum.affine[3][k];
-        const Real gx = momentum.act_bar[0][k], gy = momentum.act_bar[1][k];
-        Real fx_bar = 0, fy_bar = 0, masses = 0;
-        three([&](int p) {
-            Real row = 0, row_slope = 0, row_x = 0, row_y = 0, row_mass = 0;
-            three([&](int q) {
-                const int n = 3 * p + q;
-                const Real vx = velocity.v[n][0][k], vy = velocity.v[n][1][k];
-                const Real px = p_bar.v[n][0][k], py = p_bar.v[n][1][k], m = mass_bar.v[n][k];
-                Real value = vx_bar * vx + vy_bar * vy + mass * m + mvx * px + mvy * py;
-                if (muscles) value += gx * field.v[n][0][k] + gy * field.v[n][1][k];
-                const Real along_x = cxx * vx + cyx * vy + pxx * px + pyx * py;
-                const Real along_y = cxy * vx + cyy * vy + pxy * px + pyy * py;
-                value += (p - fx) * along_x + (q - fy) * along_y;
-                const Real w = at.wy[q][k];
-                row += w * value, row_slope += weight_slope(fy, q) * value;
-                row_x += w * along_x, row_y += w * along_y, row_mass += w * m;
-            });
-            const Real w = at.wx[p][k];
-            fx_bar += weight_slope(fx, p) * row - w * row_x;
-            fy_bar += w * (row_slope - row_y);
-            masses += w * row_mass;
-        });
+        const Real mass = momentum.mass[k], scale = 4 * inverse_h;
+        const PositionFactors factors{
+            mass,
+            mass * state.v[VX][k],
+            mass * state.v[VY][k],
+            bar.v[VX][k] + dt * bar.v[X][k],
+            bar.v[VY][k] + dt * bar.v[Y][k],
+            {scale * bar.v[C0][k], scale * bar.v[C1][k], scale * bar.v[C2][k], scale * bar.v[C3][k]},
+            {h * momentum.affine[0][k], h * momentum.affine[1][k], h * momentum.affine[2][k], h * momentum.affine[3][k]},
+            momentum.act_bar[0][k],
+            momentum.act_bar[1][k]};
+        const PositionBar sum = ::position_adjoint<muscles>(
+            at.fx[k], at.fy[k], [&](int p) INLINE_LAMBDA { return at.wx[p][k]; },
+            [&](int q) INLINE_LAMBDA { return at.wy[q][k]; }, factors,
+            [&](int p, int q, int c) INLINE_LAMBDA { return velocity.v[3 * p + q][c][k]; },
+            [&](int p, int q, int c) INLINE_LAMBDA { return p_bar.v[3 * p + q][c][k]; },
+            [&](int p, int q) INLINE_LAMBDA { return mass_bar.v[3 * p + q][k]; },
+            [&](int p, int q, int c) INLINE_LAMBDA { return field.v[3 * p + q][c][k]; });
         const bool on = at.on[k] != 0;
-        const Real x_bar = on ? fx_bar * inverse_h : 0, y_bar = on ? fy_bar * inverse_h : 0;
+        const Real x_bar = on ? sum.fx * inverse_h : 0, y_bar = on ? sum.fy * inverse_h : 0;
         bar.v[X][k] += x_bar, bar.v[Y][k] += y_bar;
         origin_bar[k] -= x_bar, origin_bar[LANES + k] -= y_bar;
         bar.v[VX][k] = on ? mass * momentum.v_bar[0][k] : bar.v[VX][k];
         bar.v[VY][k] = on ? mass * momentum.v_bar[1][k] : bar.v[VY][k];
         for (int c = 0; c < 4; ++c) bar.v[C0 + c][k] = on ? momentum.C_bar[c][k] : bar.v[C0 + c][k];
-        if (mass_values_bar) mass_values_bar[k] += on ? masses : 0;
+        if (mass_values_bar) mass_values_bar[k] += on ? sum.mass : 0;
     }
 }
 
-// Snow that moves faster than a substep resolves passes no derivative on, see Snow in torchmpm/materials/snow.py.
 PASS void drop_unresolved(Bounds bounds, const Block& state, Block& bar) {
-    const Real limit = square(LARGEST_STRAIN * bounds.resolved_rate);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
-        const bool drop = square(state.v[C0][k]) + square(state.v[C1][k]) + square(state.v[C2][k]) +
-                              square(state.v[C3][k]) > limit;
+        const bool drop = unresolved(bounds, matrix(state, C0, k));
         for (int c = 0; c < COMPONENTS; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
     }
 }

@@ -27,22 +27,6 @@ struct RuleCodes {
     }
 };
 
-// Velocity of one node under one rule.
-INLINE void constrain(const Rule& rule, Real (&v)[2]) {
-    Real &normal = v[rule.axis], &tangent = v[1 - rule.axis];
-    if (!(rule.sign > 0 ? normal > 0 : normal < 0)) return;
-    if (std::isinf(rule.friction))
-        tangent = 0;
-    else if (rule.friction != 0)
-        tangent = std::copysign(at_least(std::abs(tangent) - rule.friction * std::abs(normal), 0), tangent);
-    normal = 0;
-}
-
-INLINE void constrain(const Scene& scene, uint32_t code, Real (&v)[2]) {
-    for (; code; code >>= 8)
-        if (code & 255) constrain(scene.rules[(code & 255) - 1], v);
-}
-
 // One thread's share of the rows of a box.
 struct Rows {
     int begin, end;
@@ -103,16 +87,16 @@ INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleC
     const Real* in = total - 4 * span.begin;
 #pragma omp simd
     for (int j = span.inner_begin; j < span.inner_end; ++j) {
-        const Real inverse = 1 / (in[4 * j + 2] + epsilon);
-        out[2 * j] = (in[4 * j] * inverse + gx) * damping;
-        out[2 * j + 1] = (in[4 * j + 1] * inverse + gy) * damping;
+        const Real inverse = inverse_mass(in[4 * j + 2], epsilon);
+        out[2 * j] = node_velocity(in[4 * j], inverse, gx, damping);
+        out[2 * j + 1] = node_velocity(in[4 * j + 1], inverse, gy, damping);
     }
     if (record.velocity) {
-        Real *raw = record.velocity - 2 * span.begin, *inverse_mass = record.inverse_mass - span.begin;
+        Real *raw = record.velocity - 2 * span.begin, *inverses = record.inverse_mass - span.begin;
 #pragma omp simd
         for (int j = span.inner_begin; j < span.inner_end; ++j) {
-            const Real inverse = 1 / (in[4 * j + 2] + epsilon);
-            inverse_mass[j] = inverse;
+            const Real inverse = inverse_mass(in[4 * j + 2], epsilon);
+            inverses[j] = inverse;
             raw[2 * j] = in[4 * j] * inverse, raw[2 * j + 1] = in[4 * j + 1] * inverse;
         }
     }
@@ -120,7 +104,7 @@ INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleC
     for (int j = span.inner_begin; j < span.inner_end; ++j)
         if (code[j]) {
             Real v[2] = {out[2 * j], out[2 * j + 1]};
-            constrain(scene, code[j], v);
+            constrain(scene.rules, code[j], v);
             out[2 * j] = v[0], out[2 * j + 1] = v[1];
         }
 }

@@ -1,36 +1,7 @@
 // Adjoint of grid.hpp.
 #pragma once
+#include "../common/node_adjoint.hpp"
 #include "grid.hpp"
-
-// Turns the derivative in the velocity after a rule into that in the velocity before it, `v`, in place.
-INLINE void constrain_adjoint(const Rule& rule, const Real (&v)[2], Real (&bar)[2]) {
-    const Real normal = v[rule.axis], tangent = v[1 - rule.axis];
-    if (!(rule.sign > 0 ? normal > 0 : normal < 0)) return;
-    Real &normal_bar = bar[rule.axis], &tangent_bar = bar[1 - rule.axis];
-    normal_bar = 0;
-    if (std::isinf(rule.friction)) {
-        tangent_bar = 0;
-    } else if (rule.friction != 0) {
-        const bool slides = std::abs(tangent) - rule.friction * std::abs(normal) >= 0;
-        const Real drag = (tangent > 0) == (normal > 0) ? -rule.friction * tangent_bar : rule.friction * tangent_bar;
-        if (slides) normal_bar = drag;
-        if (!slides) tangent_bar = 0;
-    }
-}
-
-// All rules of a node: `v` becomes the velocity after them, `bar` the derivative in the velocity before them.
-INLINE void constrain_adjoint(const Scene& scene, uint32_t code, Real (&v)[2], Real (&bar)[2]) {
-    const Rule* rules[4];
-    Real before[4][2];
-    int count = 0;
-    for (; code; code >>= 8)
-        if (code & 255) {
-            before[count][0] = v[0], before[count][1] = v[1];
-            rules[count] = &scene.rules[(code & 255) - 1];
-            constrain(*rules[count++], v);
-        }
-    while (count-- > 0) constrain_adjoint(*rules[count], before[count], bar);
-}
 
 // Grids that the adjoint of a particle reads.
 struct NodeBars {
@@ -54,13 +25,13 @@ INLINE void node_adjoint(const Scene& scene, const Real* gravity, const RuleCode
     for (int j = span.inner_begin; j < span.inner_end; ++j) {
         Real v[2] = {(raw[2 * j] + gx) * damping, (raw[2 * j + 1] + gy) * damping};
         Real bar[2] = {in[4 * j], in[4 * j + 1]};
-        if (code[j]) constrain_adjoint(scene, code[j], v, bar);
+        if (code[j]) constrain_adjoint(scene.rules, code[j], v, bar);
         for (int c = 0; c < 2; ++c) {
             v_row[2 * j + c] = v[c];
             bar[c] *= damping;
             gravity_bar[c] += bar[c];
-            p_row[2 * j + c] = bar[c] * inverse[j];
         }
-        m_row[j] = -(raw[2 * j] * p_row[2 * j] + raw[2 * j + 1] * p_row[2 * j + 1]);
+        const NodeBar node = ::node_adjoint(bar, {raw[2 * j], raw[2 * j + 1]}, inverse[j]);
+        p_row[2 * j] = node.momentum[0], p_row[2 * j + 1] = node.momentum[1], m_row[j] = node.mass;
     }
 }

@@ -3,20 +3,13 @@
 #include <algorithm>
 #include <vector>
 
-#include "material.hpp"
+#include "../common/node.hpp"
+#include "../common/stencil.hpp"
+#include "../common/tables.hpp"
+#include "simd.hpp"
 #include "team.hpp"
 
 // Documented in torchmpm/native/tables.py.
-struct BodyTable {
-    int64_t first, count, kind, muscle, varying, column;
-    double hardening_low, hardening_high, shear_cutoff, resolved_rate;
-};
-
-struct RuleTable {
-    int64_t axis, world, slot;
-    double sign, i_low, i_high, j_low, j_high, friction;
-};
-
 struct Tables {
     int64_t resolution, num_bodies, num_rules;
     double h, dt, margin, extent, damping, mass_epsilon, stretch_floor;
@@ -54,11 +47,8 @@ struct Body {
     int first_block;
 };
 
-struct Rule {
-    int axis;
-    Real sign;
+struct Rule : Wall {
     double range[2][2];  // inclusive nodes in x and y
-    Real friction;       // infinite: sticks
     bool world;
     int slot;
 };
@@ -80,18 +70,18 @@ struct Scene {
         mass_epsilon = Real(t.mass_epsilon);
         for (const BodyTable* b = t.bodies; b != t.bodies + t.num_bodies; ++b) add(*b, Real(t.stretch_floor));
         for (const RuleTable* r = t.rules; r != t.rules + t.num_rules; ++r)
-            rules.push_back({int(r->axis), Real(r->sign), {{r->i_low, r->i_high}, {r->j_low, r->j_high}},
-                             Real(r->friction), r->world != 0, int(r->slot)});
+            rules.push_back({{int(r->axis), Real(r->sign), Real(r->friction)},
+                             {{r->i_low, r->i_high}, {r->j_low, r->j_high}},
+                             r->world != 0,
+                             int(r->slot)});
         // The groups of blocks that are summed separately depend only on the particles of one simulation, so results do
         // not depend on threads or on the other simulations of the batch.
         parts = blocks < 16 ? 1 : blocks < 128 ? 2 : blocks < 512 ? 4 : 8;
     }
 
     void add(const BodyTable& b, Real stretch_floor) {
-        const Bounds bounds{Real(b.hardening_low), Real(b.hardening_high), Real(b.shear_cutoff), Real(b.resolved_rate),
-                            stretch_floor};
-        bodies.push_back({int(b.count), Kind(int(b.kind)), b.muscle != 0, b.varying != 0, int(b.column), bounds,
-                          int(b.first), blocks});
+        bodies.push_back({int(b.count), Kind(int(b.kind)), b.muscle != 0, b.varying != 0, int(b.column),
+                          b.bounds(stretch_floor), int(b.first), blocks});
         blocks += (bodies.back().count + LANES - 1) / LANES;
         body_of_block.resize(blocks, int(bodies.size()) - 1);
         muscles |= bodies.back().muscle && call.field;
@@ -100,6 +90,7 @@ struct Scene {
 
     int part_begin(int part) const { return int(int64_t(blocks) * part / parts); }
     const Body& body(int block) const { return bodies[body_of_block[block]]; }
+    Domain domain(const Real* origin) const { return {origin[0], origin[1], inverse_h, margin, extent, resolution}; }
     // The particles of a block among all particles.
     int first_particle(int block) const { return body(block).first + (block - body(block).first_block) * LANES; }
     int particles_in(int block) const {

@@ -1,20 +1,16 @@
-// Scalars, blocks of particles, and the vector idioms that compilers do not find by themselves.
+// Blocks of particles, and the vector idioms that compilers do not find by themselves.
 #pragma once
-#include <cmath>
 #include <cstddef>
-#include <cstdint>
 #include <type_traits>
 
-#define INLINE inline __attribute__((always_inline))
+#include "../common/scalar.hpp"
+
 #define INLINE_LAMBDA __attribute__((always_inline))
 // Work on a whole block, where the cost of a call does not matter; profiles show these functions by name.
 #define PASS inline __attribute__((noinline))
 #define PASS_MEMBER __attribute__((noinline))
 
-using Real = TORCHMPM_REAL;
-
 constexpr int LANES = 64;  // particles per block; blocks never mix bodies
-constexpr int PAD = 3;     // as torchmpm.grid.PAD
 
 typedef Real Real4 __attribute__((vector_size(4 * sizeof(Real))));
 typedef Real Real8 __attribute__((vector_size(8 * sizeof(Real))));
@@ -31,16 +27,6 @@ template <int count> struct Index {
 };
 #define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Index<sizeof(a) / sizeof(Real)>::type{__VA_ARGS__})
 #endif
-
-template <class Function> INLINE void three(Function f) {
-    f(0);
-    f(1);
-    f(2);
-}
-
-INLINE Real square(Real a) { return a * a; }
-// Propagates a NaN in `a`.
-INLINE Real at_least(Real a, Real low) { return a < low ? low : a; }
 
 // Two numbers of each operand, from all quarters alike. On x86 these shuffles run on more ports than unpacking does.
 #define PAIRS4(a, b, i, j) SHUFFLE(a, b, i, j, 4 + i, 4 + j)
@@ -72,25 +58,4 @@ INLINE void transpose(Real8 (&v)[8]) {
         v[i] = SHUFFLE(low[i], high[i], 0, 1, 2, 3, 8, 9, 10, 11);
         v[i + 4] = SHUFFLE(low[i], high[i], 4, 5, 6, 7, 12, 13, 14, 15);
     }
-}
-
-// e^x without a call, so that loops over it become vectors: 2^n times a Taylor polynomial on |r| <= ln(2) / 2.
-INLINE Real exponential(Real x) {
-    constexpr bool single = sizeof(Real) == 4;
-    constexpr Real limit = single ? 250 : 2040;
-    x = x < -limit ? -limit : x;  // far below, the polynomial would overflow
-    Real n = std::nearbyint(x * Real(1.4426950408889634));
-    n = n > -limit ? n : -limit;  // also takes a NaN, which stays in r
-    n = n < limit ? n : limit;
-    const Real r = (x - n * Real(single ? 0.693359375 : 0.693145751953125)) -
-                   n * Real(single ? -2.12194440e-4 : 1.42860682030941723212e-6);
-    Real sum = 1;
-    for (int k = single ? 8 : 14; k > 0; --k) sum = 1 + sum * r * (Real(1) / Real(k));
-    // Two factors: each is a representable power of two, while their product may overflow or underflow.
-    const int first = int(n) / 2, second = int(n) - first;
-    const auto power = [](int e) {
-        const typename std::conditional<single, uint32_t, uint64_t>::type one = 1, bias = single ? 127 : 1023;
-        return __builtin_bit_cast(Real, (one * e + bias) << (single ? 23 : 52));
-    };
-    return sum * power(first) * power(second);
 }

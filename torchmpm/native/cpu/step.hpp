@@ -1,6 +1,7 @@
 // A step of many substeps. One pass over the particles finishes a substep and begins the next: read velocities from the
 // nodes, move, deform, add mass and momentum to the nodes.
 #pragma once
+#include "../common/particle.hpp"
 #include "workspace.hpp"
 
 // What a block's particles contribute to the nodes: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C. Zero for
@@ -64,8 +65,13 @@ INLINE Mat2 matrix(const Block& block, int first, int k) {
     return {block.v[first][k], block.v[first + 1][k], block.v[first + 2][k], block.v[first + 3][k]};
 }
 
-// I + dt C
-INLINE Mat2 growth(Real dt, Mat2 C) { return {1 + dt * C.a, dt * C.b, dt * C.c, 1 + dt * C.d}; }
+// Column k of a block whose particles have their own values, or the only column.
+template <bool varying> INLINE Values values_at(const Real* table, int k) {
+    const Real* t = table + k;
+    const int stride = varying ? LANES : 1;
+    return {t[0],          t[stride],     t[2 * stride], t[3 * stride],
+            t[4 * stride], t[5 * stride], t[6 * stride], t[7 * stride]};
+}
 
 // Deform one particle and compute its contribution to the nodes. A separate function, because structures declared in the
 // body of a vector loop would be kept in memory.
@@ -73,18 +79,17 @@ template <Kind kind>
 INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k, Block& block,
                        Impulse& out) {
     const Mat2 C = matrix(block, C0, k), old = matrix(block, F0, k);
-    const Real before = block.v[JP][k], hard = hardening_factor<kind>(m, bounds, before);
-    Mat2 F = matmul(growth(dt, C), old);
+    const Real before = block.v[JP][k];
+    Mat2 F = old;
     Real Jp = before;
-    const Direction R = return_map<kind>(m, bounds, F, Jp);
-    const Sym2 tau = stress<kind>(m, hard, F, R, act_x, act_y);
+    const Sym2 tau = deform<kind>(dt, m, bounds, C, act_x, act_y, F, Jp);
     out.mass[k] = on ? m.mass : 0;
     out.vx[k] = on ? m.mass * block.v[VX][k] : 0;
     out.vy[k] = on ? m.mass * block.v[VY][k] : 0;
-    out.affine[0][k] = on ? m.factor * tau.xx + m.mass * C.a : 0;
-    out.affine[1][k] = on ? m.factor * tau.xy + m.mass * C.b : 0;
-    out.affine[2][k] = on ? m.factor * tau.xy + m.mass * C.c : 0;
-    out.affine[3][k] = on ? m.factor * tau.yy + m.mass * C.d : 0;
+    out.affine[0][k] = on ? affine_momentum(m, tau.xx, C.a) : 0;
+    out.affine[1][k] = on ? affine_momentum(m, tau.xy, C.b) : 0;
+    out.affine[2][k] = on ? affine_momentum(m, tau.xy, C.c) : 0;
+    out.affine[3][k] = on ? affine_momentum(m, tau.yy, C.d) : 0;
     block.v[F0][k] = on ? F.a : old.a, block.v[F1][k] = on ? F.b : old.b;
     block.v[F2][k] = on ? F.c : old.c, block.v[F3][k] = on ? F.d : old.d;
     if (kind == Kind::snow) block.v[JP][k] = on ? Jp : before;

@@ -2,8 +2,6 @@
 #pragma once
 #include "scene.hpp"
 
-enum Component : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, COMPONENTS };
-
 struct alignas(64) Block {
     Real v[COMPONENTS][LANES];
 };
@@ -20,12 +18,6 @@ struct Box {
     }
 };
 
-// Quadratic B-spline: weight of node p of three, counted from the first, at f cells from the first, and its derivative.
-INLINE Real weight(Real f, int p) {
-    return p == 0 ? Real(0.5) * square(Real(1.5) - f) : p == 1 ? Real(0.75) - square(f - 1) : Real(0.5) * square(f - Real(0.5));
-}
-INLINE Real weight_slope(Real f, int p) { return p == 0 ? f - Real(1.5) : p == 1 ? 2 - 2 * f : f - Real(0.5); }
-
 // Weights and distances are zero for particles that do not take part.
 struct alignas(64) Stencil {
     Real wx[3][LANES], wy[3][LANES];  // weights
@@ -35,30 +27,21 @@ struct alignas(64) Stencil {
     Box box;                          // all nodes of particles that take part
 
     PASS_MEMBER void locate(const Scene& scene, const Real* origin, const Block& block) {
-        const Real ox = origin[0], oy = origin[1], inverse_h = scene.inverse_h;
-        const Real margin = scene.margin, extent = scene.extent;
-        const Real low = -PAD, high = Real(scene.resolution);
+        const Domain domain = scene.domain(origin);
         const int width = scene.width, none = 1 << 28;
         int i0 = none, i1 = -none, j0 = none, j1 = -none;
 #pragma omp simd reduction(min : i0, j0) reduction(max : i1, j1)
         for (int k = 0; k < LANES; ++k) {
-            const Real offset = block.v[X][k] - ox;
-            const Real ux = offset * inverse_h, uy = (block.v[Y][k] - oy) * inverse_h;
-            const bool inside = (offset > margin) & (offset < extent) & (uy >= 0) & (uy <= high);
-            Real bx = std::trunc(ux - Real(0.5)), by = std::trunc(uy - Real(0.5));
-            const Real dx = inside ? ux - bx : 0, dy = inside ? uy - by : 0;
-            fx[k] = dx, fy[k] = dy, on[k] = inside ? Real(1) : Real(0);
+            const Place place = ::locate(domain, block.v[X][k], block.v[Y][k]);
+            fx[k] = place.fx, fy[k] = place.fy, on[k] = place.on ? Real(1) : Real(0);
             three([&](int p) INLINE_LAMBDA {
-                wx[p][k] = inside ? weight(dx, p) : 0;
-                wy[p][k] = inside ? weight(dy, p) : 0;
+                wx[p][k] = place.on ? weight(place.fx, p) : 0;
+                wy[p][k] = place.on ? weight(place.fy, p) : 0;
             });
-            // Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end.
-            bx = bx > low ? bx : low, by = by > low ? by : low;
-            bx = bx < high ? bx : high, by = by < high ? by : high;
-            const int i = int(bx) + PAD, j = int(by) + PAD;
+            const int i = place.i, j = place.j;
             node[k] = i * width + j;
-            const int ilow = inside ? i : none, ihigh = inside ? i : -none;
-            const int jlow = inside ? j : none, jhigh = inside ? j : -none;
+            const int ilow = place.on ? i : none, ihigh = place.on ? i : -none;
+            const int jlow = place.on ? j : none, jhigh = place.on ? j : -none;
             i0 = ilow < i0 ? ilow : i0, i1 = ihigh > i1 ? ihigh : i1;
             j0 = jlow < j0 ? jlow : j0, j1 = jhigh > j1 ? jhigh : j1;
         }

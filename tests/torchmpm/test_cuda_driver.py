@@ -1,0 +1,352 @@
+"""What the launcher asks of a GPU, recorded by drivers that launch nothing."""
+
+import ctypes
+import importlib.metadata
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from cuda_drivers import H100, RTX_4090, Recorded, Recorder, in_use
+from native_scenes import RULES
+from scenes import lively, normal, robot, robot_and_ball
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchmpm import Grid, Solver
+from torchmpm.native.cuda import compiler, launcher, plan
+from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
+from torchmpm.native.cuda.driver import Card, Launch
+from torchmpm.native.tables import BodyTable, RuleTable
+from torchmpm.solver import kernels_fail
+
+#: What a block has without asking.
+USUAL_SHARED_BYTES = 48 * 1024
+
+
+def window(count: int, **options: object) -> Solver:
+    """A robot of some particles on as many nodes as in the tasks."""
+    return robot(count, grid=Grid(128), backend="native", **options)
+
+
+def launches(
+    solver: Solver, batch: int = 1, *, dtype: torch.dtype = torch.float32, card: Card = H100, blocks: int = 1
+) -> list[Recorded]:
+    """Of a step with a field."""
+    state, nodes = lively(solver.num_particles, batch).to(dtype), solver.grid.resolution
+    with in_use(Recorder(card, blocks)) as driver, torch.no_grad():
+        solver.step(state, torch.zeros(batch, 2, nodes, nodes, dtype=dtype), substeps=100)
+    return driver.launches
+
+
+def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
+    first, second = launches(window(2000), 64)
+    assert first.kernel.shared and not first.launch.cooperative
+    assert (first.launch.blocks, first.launch.threads) == (64, 512)
+    assert USUAL_SHARED_BYTES < first.launch.shared_bytes <= H100.shared_bytes
+    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1, 1)
+    assert first.kernel.threads * first.kernel.per_thread >= 2000
+    assert not second.kernel.shared and second.launch.cooperative
+    assert second.arguments.rows == second.arguments.columns == Grid(128).width
+    assert second.arguments.team * second.kernel.threads * second.kernel.per_thread >= 2000
+    assert second.launch.blocks % second.arguments.team == 0 and second.launch.blocks <= 132
+    assert first.arguments.status == second.arguments.status != 0
+    assert first.arguments.result == second.arguments.result != 0
+
+
+def test_many_robots_take_turns_on_the_blocks_that_are_resident() -> None:
+    assert [one.launch.blocks for one in launches(window(2000), 1024)] == [132, 132]
+    assert launches(window(2000), 1024, blocks=2)[0].launch.blocks == 264
+
+
+def test_a_large_robot_takes_one_cooperative_launch() -> None:
+    """In which every thread has one particle, and all blocks are resident."""
+    (one,) = launches(window(22_000))
+    assert not one.kernel.shared and one.launch.cooperative and one.kernel.per_thread == 1
+    assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
+
+
+@pytest.mark.parametrize("batch", [1, 5])
+def test_a_robot_larger_than_the_card_has_threads(batch: int) -> None:
+    """They keep more particles each, so that all blocks of a team are resident."""
+    (one,) = launches(window(22_000), batch, card=Card(4, 101_376))
+    assert one.launch.blocks == one.arguments.team <= 4
+    assert one.arguments.team * one.kernel.threads * one.kernel.per_thread >= 22_000
+
+
+def test_two_bodies_take_teams() -> None:
+    (one,) = launches(replace(robot_and_ball(60, 30), backend="native"), 3)
+    assert one.launch.cooperative and (one.arguments.num_bodies, one.launch.blocks) == (2, 3)
+
+
+def test_double_precision_takes_a_block_where_its_nodes_fit() -> None:
+    on_h100 = launches(window(2000), dtype=torch.float64)
+    assert [one.kernel.shared for one in on_h100] == [True, False]
+    assert on_h100[0].arguments.rows >= plan.SMALLEST_WINDOW
+    assert [one.kernel.shared for one in launches(window(2000), dtype=torch.float64, card=RTX_4090)] == [False]
+    on_4090 = launches(window(2000), card=RTX_4090)
+    assert on_4090[0].kernel.shared and on_4090[0].launch.shared_bytes <= RTX_4090.shared_bytes
+
+
+def test_a_card_that_cannot_run_a_block() -> None:
+    with pytest.raises(ValueError, match="the card cannot run a block of 256 threads"):
+        launches(window(22_000), card=Card(1, 100))
+
+
+def test_gradients() -> None:
+    """Those that are wanted, on a tape for each resident block; the others have no memory to be written to."""
+    solver, field = window(2000), torch.zeros(200, 2, 128, 128, requires_grad=True)
+    with in_use(Recorder()) as driver:
+        end = solver.step(lively(2000, 200).to(torch.float32), field, substeps=100)
+        end.x.sum().backward()
+    forward, adjoint = driver.launches[:2], driver.launches[2:]
+    assert [one.kernel.adjoint for one in driver.launches] == [False, False, True, True]
+    for one in adjoint:
+        assert one.arguments.result_bar and one.arguments.components_bar and one.arguments.field_bar
+        assert one.arguments.values_bar is None and one.arguments.result is None
+        sizes = (one.arguments.rows, one.arguments.columns, 128, 2000, 100)
+        assert one.arguments.scratch_bytes == one.kernel.scratch_bytes(*sizes) > 100 * 13 * 2000 * 4
+    assert adjoint[0].launch.blocks == 132 and adjoint[0].arguments.team == 1
+    for one in forward:
+        assert one.arguments.result_bar is one.arguments.components_bar is one.arguments.field_bar is None
+
+
+def test_kernels_are_those_of_the_scene() -> None:
+    first, _ = launches(window(2000))
+    assert (first.kernel.real, first.kernel.kinds, first.kernel.muscles) == ("float", 2, True)
+    with in_use(Recorder()) as driver, torch.no_grad():
+        window(2000).step(lively(2000), substeps=1)
+    assert (driver.launches[0].kernel.real, driver.launches[0].kernel.muscles) == ("double", False)
+
+
+class Operators(TorchDispatchMode):
+    """Names of the operators that are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.names.append(str(function))
+        return function(*args, **(kwargs or {}))
+
+
+def test_arguments_are_those_of_the_call() -> None:
+    """Sizes, constants, and the bytes of the tables on the device."""
+    solver, kept = replace(window(50, rules=RULES), damping=0.999), []
+    state, origin = lively(50, 3), normal(3, 2, seed=1)
+    field = normal(3, 2, 128, 128, seed=2)
+
+    class Reader(Recorder):
+        def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
+            super().launch(function, launch, arguments, device)
+            bodies = (BodyTable * arguments.num_bodies).from_address(arguments.bodies)
+            rules = (RuleTable * arguments.num_rules).from_address(arguments.rules)
+            counters = ctypes.c_int32 * (launch.cooperative * launch.blocks // arguments.team * COUNTERS)
+            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters or 1))))
+
+    with in_use(Reader()) as driver, torch.no_grad():
+        solver.step(state, field, substeps=7, origin=origin)
+    tables = solver.kernels.tables
+    for one, (bodies, rules, counters) in zip(driver.launches, kept, strict=True):
+        found = one.arguments
+        assert (found.batch, found.particles, found.substeps, found.resolution) == (3, 50, 7, 128)
+        assert (found.field, found.origin) == (field.data_ptr(), origin.data_ptr())
+        assert (found.h, found.dt, found.damping) == (1 / 128, solver.dt, 0.999)
+        assert (found.values_batch, found.value_columns) == (1, 1)
+        assert bodies == bytes(tables.bodies[0])
+        assert rules == b"".join(bytes(rule) for rule in tables.rules[: len(RULES)])
+        assert not any(counters)
+
+
+def test_a_second_step_copies_nothing_to_the_device() -> None:
+    """It only makes room for results and scratch memory, and sets counters to zero."""
+    state, solver = lively(50), window(50)
+    with in_use(Recorder()), torch.no_grad():
+        solver.step(state)
+        with Operators() as seen:
+            solver.step(state)
+    assert not [name for name in seen.names if re.search("scalar|pin|lift", name)], seen.names
+
+
+def test_too_little_memory_means_fewer_robots_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Down to one; if there is none for that, the error says what it needs."""
+    free, empty = 10**8, torch.empty
+
+    def limited(*shape: object, **options: object) -> Tensor:
+        if options.get("dtype") is torch.uint8 and shape[0] > free:  # type: ignore[operator]
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return empty(*shape, **options)  # type: ignore[call-overload]
+
+    solver, field = window(2000), torch.zeros(200, 2, 128, 128, requires_grad=True)
+    with in_use(Recorder()) as driver:
+        end = solver.step(lively(2000, 200).to(torch.float32), field, substeps=100)
+        monkeypatch.setattr(launcher.torch, "empty", limited)
+        torch.autograd.grad(end.x.sum(), field, retain_graph=True)
+        for one in driver.launches[2:]:
+            teams = one.launch.blocks // one.arguments.team
+            assert 1 <= teams < 132 and teams * one.arguments.scratch_bytes <= free
+        free = 10**6
+        with pytest.raises(torch.OutOfMemoryError, match=r"backend 'native' is out of memory: a robot needs 0\.\d+ GB"):
+            torch.autograd.grad(end.x.sum(), field)
+
+
+needs_bindings = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-bindings")
+
+PROGRAM = """
+import contextlib, types
+import torch
+from torchmpm.native.cuda.arguments import Arguments
+from torchmpm.native.cuda.driver import Cuda, Launch
+
+torch.cuda.device = lambda device: contextlib.nullcontext()
+torch.cuda.current_stream = lambda device: types.SimpleNamespace(cuda_stream=0xABC)
+driver, device = Cuda(), torch.device("cuda", 1)
+print(*driver.card(device), flush=True)
+function = driver.function(b"a binary", "torchmpm_forward", device)
+print(driver.resident(function, 512, 65000, device), flush=True)
+for launch in (Launch(6, 512, 65000), Launch(8, 256, 4096, cooperative=True), Launch(13, 512)):
+    driver.launch(function, launch, Arguments(batch=5, particles=77), device)
+"""
+
+
+@needs_bindings
+def test_what_reaches_the_driver_library(tmp_path: Path) -> None:
+    """Through NVIDIA's bindings: sizes, attributes, the stream, the struct by value, and what an error becomes."""
+    library, here = tmp_path / "libcuda.so.1", Path(__file__).parent
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, here / "libcuda.c", "-ldl"], check=True)
+    path = os.pathsep.join(filter(None, sys.path))
+    environment = {**os.environ, "LD_LIBRARY_PATH": str(tmp_path), "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True)
+    assert done.stdout.splitlines() == [
+        "132 232448",
+        "load a binary",
+        "kernel torchmpm_forward of 0x10",
+        "attribute 8 of 0x20 on 1: 231424",
+        "context 0x101",
+        "occupancy of 0x20: 512, 65000",
+        "264",
+        "launch 0x20: 6 1 1, 512 1 1, 65000 bytes, stream 0xabc, batch 5, particles 77",
+        "together 0x20: 8 1 1, 256 1 1, 4096 bytes, stream 0xabc, batch 5, particles 77",
+        "launch 0x20: 13 1 1, 512 1 1, 0 bytes, stream 0xabc, batch 5, particles 77",
+    ], done.stderr
+    assert done.stderr.endswith("CUDA error: CUDA_ERROR_ILLEGAL_ADDRESS: an illegal memory access was encountered\n")
+
+
+@pytest.mark.parametrize(
+    ("cuda", "versions", "reason"),
+    [
+        (None, {}, "is not built for CUDA"),
+        ("13.0", {}, "needs cuda-core, which is not installed: pip install 'torchmpm[cuda13]'"),
+        ("12.8", {"cuda-core": "1"}, "needs cuda-bindings, which is not installed: pip install 'torchmpm[cuda12]'"),
+        ("12.8", {"cuda-core": "1", "cuda-bindings": "13.0.1"}, "CUDA 12.8, but cuda-bindings is 13.0.1: pip install"),
+        ("13.0", {"cuda-core": "1", "cuda-bindings": "13.0.1"}, None),
+    ],
+)
+def test_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, cuda: str | None, versions: dict[str, str], reason: str | None
+) -> None:
+    def version(name: str) -> str:
+        if name not in versions:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return versions[name]
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    found = compiler.missing(cuda)
+    assert found is None if reason is None else reason in str(found)
+
+
+KERNEL = Kernel(False, True, "float", 512, 4, 2, True)
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, str]]:
+    """What NVRTC was asked for: architectures, and the precision."""
+    asked: list[tuple[str, str]] = []
+
+    def compile_source(text: str, arch: str, macros: dict[str, str]) -> bytes:
+        asked.append((arch, macros["TORCHMPM_REAL"]))
+        return f"binary {len(asked)}".encode()
+
+    monkeypatch.setattr(compiler, "compile_source", compile_source)
+    monkeypatch.setattr(compiler, "_versions", lambda: (1, 13, 0))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return asked
+
+
+def test_a_kernel_is_compiled_once(
+    compiled: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """For each architecture, each variant, each version of the compiler and each state of the sources."""
+    for _ in range(2):
+        assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 1"
+        assert compiler.compile_kernel(KERNEL, "sm_80") == b"binary 2"
+        assert compiler.compile_kernel(KERNEL._replace(real="double"), "sm_90") == b"binary 3"
+    monkeypatch.setattr(compiler, "_versions", lambda: (1, 13, 1))
+    assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 4"
+    monkeypatch.setattr(compiler, "digest_of_sources", lambda: "others")
+    assert compiler.compile_kernel(KERNEL, "sm_90") == b"binary 5"
+    assert len(list((tmp_path / "torchmpm").glob("torchmpm_forward-sm_*.cubin"))) == 5
+    assert len(list((tmp_path / "torchmpm").iterdir())) == 5
+
+
+def test_a_folder_that_cannot_be_written(compiled: list[tuple[str, str]], tmp_path: Path) -> None:
+    (tmp_path / "torchmpm").write_text("a file where the folder should be")
+    assert [compiler.compile_kernel(KERNEL, "sm_90") for _ in range(2)] == [b"binary 1", b"binary 2"]
+
+
+needs_nvrtc = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
+
+
+@needs_nvrtc
+def test_an_error_of_the_compiler_is_shown() -> None:
+    with pytest.raises(ValueError, match=r"(?s)cannot be compiled for sm_90: .*broken"):
+        compiler.compile_source("broken", "sm_90", {})
+
+
+@needs_nvrtc
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_kernels_compile(adjoint: bool, shared: bool) -> None:
+    """For the oldest card; `make cuda-kernels` compiles all for all."""
+    kernel = Kernel(adjoint, shared, "float", 256, 2, 7, True)
+    assert compiler.compile_source(compiler.source_of(kernel), "sm_80", kernel.macros).startswith(b"\x7fELF")
+
+
+def test_an_old_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiler, "missing", lambda cuda: None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    compiler.unavailable.cache_clear()
+    reason = compiler.unavailable(torch.device("cuda", 0))
+    compiler.unavailable.cache_clear()
+    assert reason == "on CUDA it needs a card of compute capability 8.0 or newer, cuda:0 has 7.5"
+
+
+def test_kernels_that_differ_or_fail_are_not_chosen() -> None:
+    """The check of a device says which number differed, or what went wrong; here nothing is computed at all."""
+    device = torch.device("cpu")
+    kernels_fail.cache_clear()
+    assert kernels_fail(device) is None  # the kernels of the CPU
+    kernels_fail.cache_clear()
+    with in_use(Zeros()):
+        reason = kernels_fail(device)
+    assert reason == "its kernels were tried on cpu, and x differed by 1.0e+00 from that of eager"
+    kernels_fail.cache_clear()
+    with in_use(Recorder(Card(1, 100))):
+        assert "and failed: the card cannot run a block" in str(kernels_fail(device))
+    kernels_fail.cache_clear()
+
+
+class Zeros(Recorder):
+    """Writes zeros as results."""
+
+    def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
+        if arguments.result:
+            ctypes.memset(arguments.result, 0, 4 * 13 * arguments.batch * arguments.particles)

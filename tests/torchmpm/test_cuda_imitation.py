@@ -1,0 +1,326 @@
+"""The CUDA kernels on the CPU, as in ``imitation/cuda_imitation.hpp``: threads are fibres that run in random order."""
+
+import faulthandler
+import math
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+import pytest
+import torch
+from cuda_imitation import Broken, Gpu, Imitation, Plan, Threads
+from native_scenes import NAMES, moving, solvers
+from scenes import assert_close, assert_identical, lively, normal, robot
+from test_native_adjoint import assert_gradients_close, gradients, state_leaves, value_leaves, varied
+from torch import Tensor
+
+from torchmpm import Grid, ParticleState, Solver
+from torchmpm.backends import compiler_found
+from torchmpm.native import kernels
+from torchmpm.native.cuda.compiler import FOLDERS
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+COUNT = 60
+#: Nodes in shared memory, all of them or those in a window; in global memory with one block or two for each robot; and
+#: robots that do not fit the window, which are given up and taken by two blocks.
+PLANS = {
+    "shared": Plan(),
+    "window": Plan(window=(16, 14)),
+    "one block": Plan(shared=False, team=1),
+    "team": Plan(shared=False, team=2, teams=1),
+    "given up": Plan(window=(6, 6), team=2),
+}
+every_plan = pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+
+
+@pytest.fixture
+def use(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Make the native backend run the CUDA kernels."""
+
+    def patch(plan: Plan, gpu: Gpu | None = None) -> None:
+        launcher = Imitation(gpu or Gpu(), plan)
+        monkeypatch.setattr(kernels, "forward", launcher.forward)
+        monkeypatch.setattr(kernels, "backward", launcher.backward)
+
+    return patch
+
+
+def step(solver: Solver, backend: str, *arguments: object, **options: object) -> ParticleState:
+    return replace(solver, backend=backend).step(*arguments, **options)
+
+
+@every_plan
+@pytest.mark.parametrize("name", NAMES)
+def test_equals_eager(name: str, plan: Plan, use: Callable[..., None]) -> None:
+    state, field, origin = moving(COUNT, 3)
+    solver = solvers(COUNT, 3)[name]
+    use(plan)
+    assert_close(*(step(solver, b, state, field, substeps=8, origin=origin) for b in ("native", "eager")), 1e-12)
+
+
+@every_plan
+@pytest.mark.parametrize("name", NAMES)
+def test_single_precision(name: str, plan: Plan, use: Callable[..., None]) -> None:
+    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
+    state, field, origin = moving(COUNT, 2)
+    solver = solvers(COUNT, 2)[name]
+    exact = step(solver, "eager", state, field, substeps=20, origin=origin)
+    use(plan)
+    single = state.to(torch.float32), field.float()
+    native, plain = (step(solver, b, *single, substeps=20, origin=origin.float()) for b in ("native", "eager"))
+    for field_name in ("x", "v", "C", "F", "Jp"):
+        true = getattr(exact, field_name)
+        mine, its = ((getattr(s, field_name).double() - true).norm() for s in (native, plain))
+        assert mine <= 3.0 * its + 1e-6 * true.norm(), field_name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@every_plan
+def test_order_of_threads_makes_no_difference(plan: Plan, dtype: torch.dtype, use: Callable[..., None]) -> None:
+    """Bit by bit, whatever order threads and blocks run in."""
+    state, field, origin = moving(COUNT, 3)
+    solver = solvers(COUNT, 3)["three bodies"]
+    ends = []
+    for seed in range(4):
+        use(plan, Gpu(seed))
+        ends.append(step(solver, "native", state.to(dtype), field.to(dtype), substeps=6, origin=origin.to(dtype)))
+    for end in ends[1:]:
+        assert_identical(end, ends[0])
+
+
+@every_plan
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_in_state_actuation_and_origin(name: str, plan: Plan, use: Callable[..., None]) -> None:
+    given = state_leaves(COUNT, 3)
+    use(plan)
+    found, expected = (
+        gradients(lambda _: solvers(COUNT, 3)[name], given, tuple(given), 6, b) for b in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-10)
+
+
+@every_plan
+def test_gradients_in_values(plan: Plan, use: Callable[..., None]) -> None:
+    """Of every material, in every shape; masses, volumes and gravity too."""
+    given, wanted = state_leaves(COUNT, 2) | value_leaves(COUNT, 2), tuple(value_leaves(3, 1))
+    use(plan)
+    found, expected = (
+        gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 5, b) for b in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-9)
+
+
+@every_plan
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_in_single_precision(name: str, plan: Plan, use: Callable[..., None]) -> None:
+    given = state_leaves(COUNT, 2)
+    double = gradients(lambda _: solvers(COUNT, 2)[name], given, tuple(given), 8, "eager")
+    use(plan)
+    single = {key: value.float() for key, value in given.items()}
+    found = gradients(lambda _: solvers(COUNT, 2)[name], single, tuple(given), 8, "native")
+    assert all(value.isfinite().all() for value in found.values())
+    assert_gradients_close({n: v.double() for n, v in found.items()}, double, 5e-3)
+
+
+def test_a_window_follows_fast_robots(use: Callable[..., None]) -> None:
+    """Through a grid of four times its size, with muscles and rules of the world; none of them is given up."""
+    solver = robot(COUNT, grid=Grid(40), gravity=(0.0, 0.0))
+    still = lively(COUNT, 3, corner=(0.2, 0.3))
+    state = replace(still, x=0.4 * still.x, v=torch.tensor([250.0, 180.0]) + 0.0 * still.v, C=0.0 * still.C)
+    field = 40.0 * normal(3, 2, 40, 40, seed=1)
+    use(Plan(window=(14, 12)))
+    native, eager = (step(solver, b, state, field, substeps=25) for b in ("native", "eager"))
+    assert (native.x - state.x).abs().amin() * 40 > 10, "a robot must cross nearly as many nodes as the window has"
+    assert_close(native, eager, 1e-11)
+    leaves = {"x": state.x, "v": state.v, "C": state.C, "F": state.F, "Jp": state.Jp, "actuation": field}
+    leaves["origin"] = torch.zeros(3, 2, dtype=torch.float64)
+    wanted = ("F", "actuation", "origin")
+    found, expected = (gradients(lambda _: solver, leaves, wanted, 25, b) for b in ("native", "eager"))
+    assert_gradients_close(found, expected, 1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64])
+def test_sizes(count: int, use: Callable[..., None]) -> None:
+    """Around the sizes of blocks."""
+    for plan in (Plan(), Plan(shared=False, team=2)):
+        use(plan)
+        field = 40.0 * normal(2, 2, 16, 16, seed=1)
+        assert_close(*(step(robot(count), b, lively(count, 2), field, substeps=2) for b in ("native", "eager")), 1e-12)
+
+
+def test_without_muscles(use: Callable[..., None]) -> None:
+    """Kernels that have none."""
+    solver, given = robot(COUNT), state_leaves(COUNT, 2)
+    use(Plan(muscles=False))
+    native, eager = (step(solver, b, lively(COUNT, 2), substeps=4) for b in ("native", "eager"))
+    assert_close(native, eager, 1e-12)
+    found, expected = (
+        gradients(lambda _: replace(solver, bodies=(replace(solver.bodies[0], muscle=False),)), given, ("x",), 3, b)
+        for b in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-10)
+
+
+@pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
+def test_positions_no_address_exists_for(y: float, use: Callable[..., None]) -> None:
+    """Above and below the window, and at no place, particles keep what they have."""
+    state = lively(10)
+    x = state.x.clone()
+    x[:, 3, 1] = y
+    for plan in (Plan(window=(16, 14), muscles=False), Plan(shared=False, team=2, muscles=False)):
+        use(plan)
+        native, eager = (step(robot(10, rules=()), b, replace(state, x=x), substeps=2) for b in ("native", "eager"))
+        others = [k for k in range(10) if k != 3]
+        torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
+        assert torch.equal(native.v[:, 3], state.v[:, 3])
+
+
+@pytest.mark.parametrize("corner", [(0.0, -0.1), (0.75, 0.8), (-0.2, 0.4)])
+def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None]) -> None:
+    """Where weights are extrapolated, nodes do not exist, and particles are outside."""
+    given = state_leaves(COUNT, 2) | {"x": lively(COUNT, 2, corner=corner).x}
+    for plan in (Plan(), Plan(window=(12, 12)), Plan(shared=False, team=2)):
+        use(plan)
+        found, expected = (
+            gradients(lambda _: robot(COUNT, rules=()), given, tuple(given), 4, b) for b in ("native", "eager")
+        )
+        assert_gradients_close(found, expected, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["x", "v", "F", "actuation"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_broken_robot_harms_no_other(name: str, value: float, dtype: torch.dtype, use: Callable[..., None]) -> None:
+    given = {key: t.to(dtype) for key, t in state_leaves(15, 3).items()}
+    given[name][1].view(-1)[::5] = value
+    ends = []
+    for chosen in ([0, 1, 2], [0, 2]):
+        use(Plan(team=2, teams=1))
+        leaves = {key: t[chosen].requires_grad_() for key, t in given.items()}
+        state = ParticleState(*(leaves[n] for n in ("x", "v", "C", "F", "Jp")))
+        solver = solvers(15, 1)["three bodies"]
+        final = step(solver, "native", state, leaves["actuation"], substeps=3, origin=leaves["origin"])
+        loss = final.x[[0, -1]].sum() + final.F[[0, -1]].square().sum()
+        ends.append((final.detach()[[0, -1]], torch.autograd.grad(loss, list(leaves.values()))))
+    (together, of_all), (apart, of_some) = ends
+    assert_identical(together, apart)
+    for one, other in zip(of_all, of_some, strict=True):
+        torch.testing.assert_close(one[[0, 2]], other, rtol=0, atol=1e-5 * other.abs().max().item())
+
+
+def test_not_a_number_spreads_as_on_the_cpu(use: Callable[..., None]) -> None:
+    """To the particles around it, and not as zero or as a number that looks right."""
+    state = lively(COUNT, 2)
+    F = state.F.clone()
+    F[1, 7] = math.nan
+    plain = step(robot(COUNT), "eager", replace(state, F=F), substeps=2)
+    for plan in (Plan(team=2, muscles=False), Plan(shared=False, team=1, muscles=False)):
+        use(plan)
+        native = step(robot(COUNT), "native", replace(state, F=F), substeps=2)
+        assert torch.equal(native.v.isfinite(), plain.v.isfinite())
+        torch.testing.assert_close(native.v, plain.v, rtol=0, atol=1e-11, equal_nan=True)
+    assert 0 < plain.v[1].isnan().sum() < 2 * COUNT
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_robots_that_leave_the_range_of_the_sums_are_taken_again(dtype: torch.dtype, use: Callable[..., None]) -> None:
+    """Muscles of a strong field that a robot enters make it faster than shared memory has room for."""
+    still = lively(COUNT, 2, strain=0.0)
+    state = replace(still, v=torch.tensor([200.0, 0.0]) + 0.0 * still.v, C=0.0 * still.C).to(dtype)
+    field = torch.zeros(2, 2, 16, 16, dtype=dtype)
+    field[1, :, 12:] = 1e7
+    solver = robot(COUNT, rules=(), gravity=(0.0, 0.0))
+    eager = step(solver, "eager", state, field, substeps=6)
+    use(Plan())
+    alone = step(solver, "native", state, field, substeps=6)
+    assert alone.v[0].isfinite().all() and alone.v[1].isnan().all(), "the second must have been given up"
+    use(Plan(team=2))
+    assert_close(step(solver, "native", state, field, substeps=6), eager, 1e-10 if dtype == torch.float64 else 1e-4)
+
+
+# What a test can take away from the kernels.
+BARRIERS, ATOMICS = (
+    re.findall(r"^    ([A-Z_]+)[,\n]", enum, re.MULTILINE)[:-1]
+    for enum in re.findall(r"^enum [^{]*{(.*?)^};", (FOLDERS[0] / "machine.cuh").read_text(), re.DOTALL | re.MULTILINE)
+)
+Ends = list[list[Tensor]]
+#: Robots whose blocks pass every barrier and use every atomic operation: a window that must move, a team of blocks,
+#: robots that are given up.
+SCENES = (Plan(window=(14, 12), teams=1), Plan(shared=False, team=2, teams=1), Plan(window=(6, 6), teams=1, team=1))
+
+
+def outcomes(gpu: Gpu, use: Callable[..., None]) -> Iterator[list[Tensor]]:
+    """States and derivatives in all scenes; an empty list where a launch did not end well."""
+    solver = robot(40, grid=Grid(24), rules=robot(1).rules)
+    given = {key: value for key, value in state_leaves(40, 2).items() if key not in ("actuation", "origin")}
+    given["x"], given["v"] = 0.8 * lively(40, 2).x, given["v"] + torch.tensor([250.0, -150.0])
+    given["actuation"], given["origin"] = 40.0 * normal(2, 2, 24, 24, seed=1), torch.zeros(2, 2).double()
+    for plan in SCENES:
+        use(plan, gpu)
+        leaves = {key: value.clone().requires_grad_() for key, value in given.items()}
+        state = ParticleState(*(leaves[name] for name in ("x", "v", "C", "F", "Jp")))
+        try:
+            end = step(solver, "native", state, leaves["actuation"], substeps=8, origin=leaves["origin"])
+            yield [end.stack().detach(), *torch.autograd.grad(end.stack().square().sum(), tuple(leaves.values()))]
+        except Broken:
+            yield []
+
+
+def same(first: list[Tensor], second: list[Tensor]) -> bool:
+    """Whether states are the same bit for bit, and derivatives but for rounding."""
+    if not first or not second or not torch.equal(first[0], second[0]):
+        return False
+    return all((a - b).abs().max() <= 1e-9 * b.abs().max() for a, b in zip(first[1:], second[1:], strict=True))
+
+
+@pytest.fixture(scope="module")
+def intact() -> Ends:
+    with pytest.MonkeyPatch.context() as patch:
+        return list(outcomes(Gpu(), use.__wrapped__(patch)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_missing(seed: int, intact: Ends, use: Callable[..., None]) -> None:
+    assert all(map(same, outcomes(Gpu(seed), use), intact))
+
+
+def noticed(gpu: Gpu, intact: Ends, use: Callable[..., None]) -> bool:
+    """Whether numbers differ, or the kernels fail; in a process of its own, as they may write anywhere."""
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        faulthandler.disable()
+        with suppress(BaseException):
+            os._exit(int(not all(same(*pair) for pair in zip(outcomes(gpu, use), intact, strict=True))))
+        os._exit(1)
+    return os.waitpid(child, 0)[1] != 0
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_every_barrier_is_needed(name: str, intact: Ends, use: Callable[..., None]) -> None:
+    """Without it, some order of threads gives other numbers, or threads wait for ever."""
+    index = BARRIERS.index(name)
+    assert any(noticed(Gpu(seed, missing_barrier=index), intact, use) for seed in range(5))
+
+
+@pytest.mark.parametrize("name", ATOMICS)
+def test_every_atomic_operation_is_needed(name: str, intact: Ends, use: Callable[..., None]) -> None:
+    """As a load and a store, between which other threads run, it loses what they add."""
+    index = ATOMICS.index(name)
+    assert any(noticed(Gpu(seed, plain_atomic=index), intact, use) for seed in range(5))
+
+
+def test_nothing_is_noticed_where_nothing_is_missing(intact: Ends, use: Callable[..., None]) -> None:
+    assert not noticed(Gpu(seed=9), intact, use)
+
+
+@pytest.mark.parametrize("plan", [Plan(window=(14, 14)), Plan(shared=False, team=2, teams=1)], ids=["shared", "team"])
+def test_thread_sanitizer_finds_no_race(plan: Plan, use: Callable[..., None]) -> None:
+    """With real threads: two bodies, muscles, rules, robots that are given up or leave the window; both kernels."""
+    use(replace(plan, sizes=(8, 4)), Threads())
+    given = {key: value.float() for key, value in state_leaves(30, 2).items()}
+    gradients(lambda _: solvers(30, 2)["three bodies"], given, ("x", "actuation"), 3, "native")

@@ -1,0 +1,261 @@
+"""The whole way of a step through the CUDA kernels on a GPU; without one, the main things on an imitation of it.
+
+What the kernels do there under all plans of a launch is tested in test_cuda_imitation.py.
+"""
+
+import gc
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from cuda_drivers import Imitation, in_use
+from native_scenes import NAMES, RULES, moving, solvers
+from scenes import assert_close, assert_identical, lively, normal, robot
+from test_native_adjoint import (
+    STATE,
+    Leaves,
+    assert_gradients_close,
+    corner_leaves,
+    gradients,
+    state_leaves,
+    value_leaves,
+    varied,
+)
+from test_resolved import hard_soil, hardened
+from torch import Tensor
+
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
+from torchmpm.backends import compiler_found
+from torchmpm.solver import kernels_fail
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+COUNT = 45
+ON_A_GPU = pytest.param("cuda", marks=pytest.mark.cuda)
+on_a_gpu = pytest.mark.parametrize("device", [ON_A_GPU], indirect=True)
+
+
+@pytest.fixture(params=["imitation", ON_A_GPU], autouse=True)
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Where the tensors are; meanwhile the native backend runs the CUDA kernels."""
+    if request.param == "cuda":
+        yield "cuda"
+    else:
+        with in_use(Imitation()):
+            yield "cpu"
+
+
+def both(solver: Solver, device: str, *arguments: Tensor | ParticleState, **options: object) -> list[ParticleState]:
+    """The final states of the native and of the eager backend."""
+    arguments = tuple(a.to(device) for a in arguments)
+    options = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in options.items()}
+    return [replace(solver, backend=name).step(*arguments, **options) for name in ("native", "eager")]
+
+
+def both_gradients(
+    solver: Callable[[Leaves], Solver], device: str, given: Leaves, wanted: tuple[str, ...], substeps: int
+) -> None:
+    """Compare the derivatives of the native and of the eager backend."""
+    given = {name: value.to(device) for name, value in given.items()}
+    found, expected = (gradients(solver, given, wanted, substeps, name) for name in ("native", "eager"))
+    assert all(value.isfinite().all() for value in found.values())
+    assert_gradients_close(found, expected, 1e-8)
+    assert expected[wanted[0]].abs().max() > 0
+
+
+@pytest.mark.parametrize("batch", [1, 5])
+@pytest.mark.parametrize("name", NAMES)
+def test_equals_eager(name: str, batch: int, device: str) -> None:
+    """In double precision: particles leave the window, touch rules, flow, harden."""
+    state, field, origin = moving(COUNT, batch)
+    assert_close(*both(solvers(COUNT, batch)[name], device, state, field, substeps=5, origin=origin), 1e-9)
+
+
+@pytest.mark.parametrize("name", ["von Mises", "three bodies"])
+def test_single_precision(name: str, device: str) -> None:
+    state, field, origin = moving(COUNT, 2)
+    solver = solvers(COUNT, 2)[name]
+    exact = replace(solver, backend="eager").step(state, field, substeps=5, origin=origin)
+    single = both(solver, device, state.to(torch.float32), field.float(), substeps=5, origin=origin.float())[0]
+    assert single.dtype == torch.float32
+    assert_close(single.to("cpu", torch.float64), exact, 1e-4)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 128, 129, 300])
+def test_sizes(count: int, device: str) -> None:
+    """Around those of a block and of a team of blocks."""
+    assert_close(*both(robot(count), device, lively(count, 2), 40.0 * normal(2, 2, 16, 16, seed=1), substeps=2), 1e-9)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("count", [0, 1, 3, len(RULES)])
+def test_rules(count: int, device: str) -> None:
+    """From none to all directions, overlapping, with and without friction, in the world's and the window's frame."""
+    both_gradients(lambda _: robot(30, rules=RULES[:count]), device, state_leaves(30, 2), ("x", "v"), 2)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_in_state_actuation_and_origin(name: str, device: str) -> None:
+    given = state_leaves(COUNT, 2)
+    both_gradients(lambda _: solvers(COUNT, 2)[name], device, given, tuple(given), 4)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_gradients_in_values(batch: int, device: str) -> None:
+    """Of every material, in every shape; masses, volumes and gravity too."""
+    given = state_leaves(COUNT, batch) | value_leaves(COUNT, batch)
+    both_gradients(lambda leaves: varied(COUNT, leaves), device, given, tuple(value_leaves(3, 1)), 4)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("wanted", ["actuation", "mu", "gravity", "x", "origin"])
+def test_gradient_in_one_thing_alone(wanted: str, device: str) -> None:
+    given = state_leaves(30, 2) | value_leaves(30, 2)
+    both_gradients(lambda leaves: varied(30, leaves), device, given, (wanted,), 1)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Snow(800.0, 500.0)])
+def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic, device: str) -> None:
+    solver = robot(12, bodies=(Body(12, material, muscle=True),))
+    both_gradients(lambda _: solver, device, corner_leaves(), STATE, 1)
+
+
+@on_a_gpu
+def test_limited_gradients_of_soil(device: str) -> None:
+    """Hardened soil and spinning grains, see test_resolved.py."""
+    given = hardened(batch=2)
+    both_gradients(lambda _: hard_soil(), device, given, tuple(given), 3)
+
+
+@on_a_gpu
+def test_gradients_of_soil_in_single_precision_are_finite(device: str) -> None:
+    """Strains whose squares are smaller than the smallest normal number have derivatives like others."""
+    leaves = {name: value.float().to(device) for name, value in state_leaves(30, 1).items()}
+    small = torch.eye(2) + 1e-20 * normal(1, 30, 2, 2, seed=3).float()
+    leaves["F"] = small.to(device)
+    solver = replace(solvers(30, 1)["soil"], backend="native")
+    found = gradients(lambda _: solver, leaves, ("x", "v", "F"), 3, "native")
+    assert all(value.isfinite().all() for value in found.values())
+
+
+@on_a_gpu
+def test_muscles_without_actuation_and_actuation_without_muscles(device: str) -> None:
+    assert_close(*both(robot(20), device, lively(20), substeps=2), 1e-9)
+    passive = robot(20, bodies=(Body(20, VonMises(500.0, 50.0, 60.0)),))
+    assert_close(*both(passive, device, lively(20), normal(1, 2, 16, 16, seed=1), substeps=2), 1e-9)
+    given = state_leaves(20, 1)
+    zero = gradients(lambda _: passive, {k: v.to(device) for k, v in given.items()}, ("actuation",), 2, "native")
+    assert not zero["actuation"].any()
+
+
+@on_a_gpu
+def test_window_of_another_size_and_spacing(device: str) -> None:
+    solver = robot(20, grid=Grid(33, spacing=0.05, margin=0.01), rules=(VelocityRule("-y", j=(None, 10)),))
+    state = lively(20, corner=(0.9, 0.4))
+    assert_close(*both(solver, device, state, normal(1, 2, 33, 33, seed=1), substeps=3), 1e-9)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, -5.0, 5.0])
+def test_positions_no_address_exists_for(y: float, device: str) -> None:
+    """Above and below the window, and at no place, particles keep what they have."""
+    state = lively(10)
+    x = state.x.clone()
+    x[:, 3, 1] = y
+    native, eager = both(robot(10, rules=()), device, replace(state, x=x), substeps=2)
+    others = [k for k in range(10) if k != 3]
+    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-10)
+    assert torch.equal(native.v[:, 3].cpu(), state.v[:, 3])
+
+
+@on_a_gpu
+@pytest.mark.parametrize("name", ["x", "F", "actuation"])
+@pytest.mark.parametrize("value", [float("nan"), 1e30])
+def test_a_broken_element_harms_no_other(name: str, value: float, device: str) -> None:
+    given = state_leaves(15, 3)
+    given[name][1].view(-1)[::5] = value
+    given = {key: t.to(device).requires_grad_() for key, t in given.items()}
+    solver, ends = replace(solvers(15, 1)["von Mises"], backend="native"), []
+    for chosen in (slice(None), [0, 2]):
+        leaves = {key: t[chosen] for key, t in given.items()}
+        state = ParticleState(*(leaves[n] for n in STATE))
+        final = solver.step(state, leaves["actuation"], substeps=3, origin=leaves["origin"])
+        final = final[[0, 2]] if chosen == slice(None) else final
+        ends.append((final, torch.autograd.grad(final.x.sum() + final.F.square().sum(), list(given.values()))))
+    (together, of_all), (apart, of_some) = ends
+    assert_identical(together, apart)
+    for one, other in zip(of_all, of_some, strict=True):
+        torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=0, atol=1e-9 * other.abs().max().item())
+
+
+def test_results_are_the_same_in_every_run_and_in_every_batch(device: str) -> None:
+    """Bit for bit: sums of integers do not depend on their order."""
+    state, field, origin = (t.to(device) for t in moving(COUNT, 5))
+    solver = replace(solvers(COUNT, 1)["three bodies"], backend="native")
+    first, again = (solver.step(state, field, substeps=5, origin=origin) for _ in range(2))
+    assert_identical(first, again)
+    assert_identical(solver.step(state[[3]], field[[3]], substeps=5, origin=origin[[3]]), first[[3]])
+
+
+def test_long_steps_are_cut(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At checkpoints; derivatives go through them."""
+    given = {name: value.to(device) for name, value in state_leaves(15, 2).items()}
+    solver = solvers(15, 2)["three bodies"]
+    monkeypatch.setattr("torchmpm.native.kernels.Kernels.tape_limit", lambda *_: 3)
+    found = gradients(lambda _: solver, given, ("x", "actuation"), 7, "native")
+    assert_gradients_close(found, gradients(lambda _: solver, given, ("x", "actuation"), 7, "eager"), 1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_check_of_a_device_passes(dtype: torch.dtype, device: str) -> None:
+    kernels_fail.cache_clear()
+    assert kernels_fail(torch.device(device, 0) if device == "cuda" else torch.device(device), dtype) is None
+    kernels_fail.cache_clear()
+
+
+@on_a_gpu
+def test_auto_is_native_on_a_gpu(device: str) -> None:
+    solver, state = robot(30, backend="auto"), lively(30).to("cuda")
+    assert solver.runs_native(state)
+    assert_identical(solver.step(state, substeps=3), replace(solver, backend="native").step(state, substeps=3))
+
+
+@on_a_gpu
+def test_on_another_stream(device: str) -> None:
+    """It waits for what that stream computes, and for nothing else."""
+    solver, state = robot(300, backend="native"), lively(300, 4).to("cuda")
+    expected, stream = solver.step(state, substeps=50), torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        late = torch.zeros_like(state.x)
+        torch.cuda._sleep(10**8)
+        late += state.x
+        found = solver.step(replace(state, x=late), substeps=50)
+    stream.synchronize()
+    assert_identical(found, expected)
+
+
+@on_a_gpu
+def test_within_a_graph_of_the_caller(device: str) -> None:
+    """A step waits for nothing and copies nothing, so that a CUDA graph can hold it."""
+    solver, state = robot(100, backend="native"), lively(100).to("cuda")
+    with torch.no_grad():
+        expected = solver.step(state, substeps=5)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            found = solver.step(state, substeps=5)
+    graph.replay()
+    assert_identical(found, expected)
+
+
+@on_a_gpu
+def test_memory_is_given_back(device: str) -> None:
+    solver, state = robot(300, backend="native"), lively(300, 4).to("cuda")
+    x = state.x.clone().requires_grad_()
+    for _ in range(2):
+        gc.collect()
+        before = torch.cuda.memory_allocated()
+        torch.autograd.grad(solver.step(replace(state, x=x), substeps=20).x.sum(), x)
+    assert torch.cuda.memory_allocated() == before
