@@ -31,7 +31,7 @@ def constant(values: Any, like: Tensor) -> Tensor:
 @cached_tensors
 def _kept(content: bytes, kind: str, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     array = np.frombuffer(content, kind).reshape(shape)
-    return to_device(torch.tensor(array, dtype=dtype, device="cpu").numpy(), device)
+    return torch.tensor(array, dtype=dtype, device=device)  # waits for the copy: other streams may read it
 
 
 def to_host(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
