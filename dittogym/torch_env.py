@@ -19,6 +19,7 @@ from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.copies import to_device
 from dittogym.core import EnvState, make_model
+from dittogym.cuda_graph import Replayed
 from dittogym.observation import SHAPE
 from dittogym.physics import Physics, check_effect, merged, physics_values
 from dittogym.render.frame import frame, png
@@ -128,6 +129,9 @@ class TorchEnv:
         self._actuation: Tensor | None = None
         # On a GPU, 0 as long as all actions since the last reset were finite, else NaN.
         self._unread = None if self.device.type == "cpu" else torch.zeros((), dtype=self.dtype, device=self.device)
+        # What a user wrote, such as materials and reward functions, is called in every step.
+        own = self.device.type == "cuda" and self.model.solver.kernels.unsupported(self.device) is None
+        self._replayed = Replayed(core.simulate) if own and backend != "eager" else None
 
     def __repr__(self) -> str:
         return f"TorchEnv({self.spec.name!r}, {self.num_envs}, {self.action_resolution}, device={str(self.device)!r})"
@@ -318,7 +322,8 @@ class TorchEnv:
             )
         checks.flag("soft", soft)
         action = to_grid_layout(self._checked(action), self.action_layout)
-        result = core.evaluate(self.model, *core.advance(self.model, self.env_state, action), soft=soft)
+        simulate = core.simulate if self._replayed is None or torch.is_grad_enabled() else self._replayed
+        result = core.judge(self.model, simulate(self.model, self.env_state, action), soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
