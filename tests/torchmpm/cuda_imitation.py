@@ -23,6 +23,8 @@ from torchmpm.native.tables import BodyTable, RuleTable
 HERE = Path(__file__).with_name("imitation")
 #: Threads of a block, and particles that each of them keeps.
 THREADS, PER_THREAD = 32, 4
+#: Bytes beyond the scratch memory that must stay as they are.
+MARGIN = 4096
 
 
 class Broken(Exception):
@@ -57,23 +59,29 @@ class Gpu:
         """
         kernels, kernel = function
         assert isinstance(arguments, Arguments)
-        ctypes.memset(arguments.scratch, 0xCB, launch.blocks // arguments.team * arguments.scratch_bytes)
+        size = launch.blocks // arguments.team * arguments.scratch_bytes
+        scratch = ctypes.create_string_buffer(b"\xcb" * (size + MARGIN), size + MARGIN)
+        arguments.scratch = ctypes.addressof(scratch)
         if arguments.result and (kernel.shared or not arguments.status):
-            size = COMPONENTS * arguments.batch * arguments.particles * kernel.real_bytes
-            ctypes.memset(arguments.result, 0xFF, size)  # NaN where nothing is written
+            numbers = COMPONENTS * arguments.batch * arguments.particles
+            ctypes.memset(arguments.result, 0xFF, numbers * kernel.real_bytes)  # NaN where nothing is written
         outcome = kernels.launch(
             ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
             ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
         )  # fmt: skip
         if outcome:
             raise Broken(("threads diverged", "threads wait for ever", "shared memory is too small")[outcome - 1])
+        if scratch.raw[size:] != b"\xcb" * MARGIN:
+            raise Broken("scratch memory is too small")
 
 
 @functools.cache
 def library(shared: bool, real: str, threads: int, per_thread: int, kinds: int, muscles: bool) -> ctypes.CDLL:
     """The kernels of given properties, see :class:`torchmpm.native.cuda.arguments.Kernel`."""
     macros = Kernel(False, shared, real, threads, per_thread, kinds, muscles).macros
-    return build(HERE / "imitation.cpp", "-O1", *options(macros))
+    kernels = build(HERE / "imitation.cpp", "-O1", *options(macros))
+    assert kernels.bytes_of_arguments() == ctypes.sizeof(Arguments)
+    return kernels
 
 
 def options(macros: dict[str, str]) -> list[str]:

@@ -19,7 +19,8 @@ from scenes import lively, normal, robot, robot_and_ball
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchmpm import Grid, Solver
+from torchmpm import Grid, ParticleState, Solver, backends
+from torchmpm.native import kernels
 from torchmpm.native.cuda import compiler, launcher, plan
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
@@ -350,3 +351,27 @@ class Zeros(Recorder):
     def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
         if arguments.result:
             ctypes.memset(arguments.result, 0, 4 * 13 * arguments.batch * arguments.particles)
+
+
+@pytest.mark.parametrize("reason", [None, "x differed"])
+def test_auto_on_a_gpu_follows_the_check(
+    reason: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And says why it is eager; whoever asks for the kernels gets them without it."""
+    asked: list[tuple[torch.device, torch.dtype]] = []
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: None)
+    monkeypatch.setattr("torchmpm.solver.kernels_fail", lambda *of: asked.append(of) or reason)
+    backends.warn_eager.cache_clear()
+    state, solver = lively(5), robot(5, backend="auto")
+    assert replace(solver, backend="native").runs_native(state) and not asked
+    assert solver.runs_native(state) == (reason is None) and asked == [(torch.device("cuda", 0), torch.float64)]
+    said = [record.message for record in caplog.records if record.name == "torchmpm.backends"]
+    assert not said if reason is None else "operator by operator" in said[0] and reason in said[0]
+
+
+def test_an_unavailable_gpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: "on CUDA it needs cuda-core")
+    with pytest.raises(ValueError, match="backend 'native' cannot run this: on CUDA it needs cuda-core; use 'eager'"):
+        robot(5, backend="native").runs_native(lively(5))

@@ -99,6 +99,8 @@ def team_pass(call: Call, card: Card, resident: Resident) -> Pass:
 
 
 def _kernel(call: Call, *, shared: bool, threads: int, per_thread: int) -> Kernel:
+    if call.adjoint:
+        per_thread = 1  # it takes any number of particles, and need not be compiled for each
     return Kernel(call.adjoint, shared, call.real, threads, per_thread, call.kinds, call.muscles)
 
 

@@ -1,5 +1,5 @@
-// The adjoint of a substep. Going back, one pass over the particles ends the adjoint of a substep and begins that of the
-// one before, as on the CPU.
+// The adjoint of a substep. Going back, one pass over the particles ends the adjoint of a substep and begins that of
+// the one before, as on the CPU.
 #pragma once
 #include "node_adjoint.hpp"
 #include "particle_adjoint.hpp"
@@ -32,8 +32,8 @@ public:
         });
     }
 
-    // Adjoint of P2G and of the weights of both transfers: turns the derivatives in the state after the substep into those
-    // in the state before it.
+    // Adjoint of P2G and of the weights of both transfers: turns the derivatives in the state after the substep into
+    // those in the state before it.
     INLINE void take(const Particle& state, Particle& bar, int index, int body_index) {
         const Body& body = robot.bodies[body_index];
         const Place at = locate(robot.domain, state.x, state.y);
@@ -84,12 +84,13 @@ private:
         }
     };
 
-    template <Kind kind>
-    INLINE void take_as(const Particle& state, Particle& bar, const Place& at, const Body& body, int index, bool muscles) {
+    template <Kind kind> INLINE void take_as(const Particle& state, Particle& bar, const Place& at, const Body& body,
+                                             int index, bool muscles) {
         const Values m = robot.values_of(body, index);
         const int first = robot.window.at(at.i, at.j), columns = robot.window.columns;
         const Real dt = robot.dt, h = robot.h, slope = 4 * robot.domain.inverse_h;
-        const Around velocity{robot.nodes.velocity + first, columns}, momentum_bar{robot.nodes.momentum_bar + first, columns};
+        const Around velocity{robot.nodes.velocity + first, columns},
+            momentum_bar{robot.nodes.momentum_bar + first, columns};
         const Around field{robot.nodes.field + first, columns};
         const auto wx = [&](int p) { return weight(at.fx, p); };
         const auto wy = [&](int q) { return weight(at.fy, q); };
@@ -100,28 +101,28 @@ private:
             const Moments moments = gather(at.fx, at.fy, wx, wy, field);
             act = {moments.value[0], moments.value[1]};
         }
-        const DeformedBar out = deform_adjoint<kind>(dt, m, body.bounds, state.C, state.F, state.Jp, act.x, act.y, P_bar,
-                                                     bar.F, bar.Jp);
-        const PositionFactors factors{m.mass,
-                                      m.mass * state.vx,
-                                      m.mass * state.vy,
-                                      bar.vx + dt * bar.x,
-                                      bar.vy + dt * bar.y,
-                                      slope * bar.C,
-                                      h * out.affine,
-                                      out.material.act_x,
-                                      out.material.act_y};
+        const DeformedBar out =
+            deform_adjoint<kind>(dt, m, body.bounds, state.C, state.F, state.Jp, act.x, act.y, P_bar, bar.F, bar.Jp);
+        const PositionFactors factors{
+            m.mass,        m.mass * state.vx, m.mass * state.vy,  bar.vx + dt * bar.x, bar.vy + dt * bar.y,
+            slope * bar.C, h * out.affine,    out.material.act_x, out.material.act_y};
         const Real* masses = robot.nodes.mass_bar + first;
         const auto mass_bar = [&](int p, int q) { return masses[p * columns + q]; };
         const auto acting = [&](int p, int q, int c) { return muscles ? field(p, q, c) : Real(0); };
-        const PositionBar sum = position_adjoint<TORCHMPM_MUSCLES>(at.fx, at.fy, wx, wy, factors, velocity, momentum_bar,
-                                                                   mass_bar, acting);
+        const PositionBar sum =
+            position_adjoint<TORCHMPM_MUSCLES>(at.fx, at.fy, wx, wy, factors, velocity, momentum_bar, mass_bar, acting);
         const Real x = sum.fx * robot.domain.inverse_h, y = sum.fy * robot.domain.inverse_h;
         origin_bar[0] -= x, origin_bar[1] -= y;
-        bar = {bar.x + x, bar.y + y, m.mass * P.value[0], m.mass * P.value[1], out.C, out.F, kind == Kind::snow ? out.Jp : bar.Jp};
+        bar = {bar.x + x,
+               bar.y + y,
+               m.mass * P.value[0],
+               m.mass * P.value[1],
+               out.C,
+               out.F,
+               kind == Kind::snow ? out.Jp : bar.Jp};
         if (robot.given.values_bar) {
-            const Real mass = state.vx * P.value[0] + state.vy * P.value[1] + P_bar.a * state.C.a + P_bar.b * state.C.b +
-                              P_bar.c * state.C.c + P_bar.d * state.C.d + sum.mass;
+            const Real mass = state.vx * P.value[0] + state.vy * P.value[1] + P_bar.a * state.C.a +
+                              P_bar.b * state.C.b + P_bar.c * state.C.c + P_bar.d * state.C.d + sum.mass;
             add_values(index, mass, out.material.values);
         }
         if (muscles && robot.given.field_bar) scatter_actuation(at, first, out.material.act_x, out.material.act_y);
@@ -153,10 +154,10 @@ private:
         velocity_bar = {0, 0};
         NodeBar out{{0, 0}, 0};
         if (robot.exists(i, j)) {
-            const Real raw[2] = {tape.x[node], tape.y[node]}, damping = Real(robot.given.damping);
-            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * damping;
+            const Real raw[2] = {tape.x[node], tape.y[node]};
+            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * robot.damping;
             constrain_adjoint(robot.rules, robot.codes[i * robot.width() + j], v, bar);
-            for (int c = 0; c < 2; ++c) bar[c] *= damping, gain_bar[c] += bar[c];
+            for (int c = 0; c < 2; ++c) bar[c] *= robot.damping, gain_bar[c] += bar[c];
             out = node_adjoint(bar, raw, tape.inverse[node]);
         }
         robot.nodes.velocity[node] = {v[0], v[1]};
