@@ -55,7 +55,7 @@ def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
     assert first.kernel.threads * first.kernel.per_thread >= 2000
     assert not second.kernel.shared and second.launch.cooperative
     assert second.arguments.rows == second.arguments.columns == Grid(128).width
-    assert second.arguments.team * second.kernel.threads * second.kernel.per_thread >= 2000
+    assert second.kernel.per_thread == 0 and second.arguments.team == 2
     assert second.launch.blocks % second.arguments.team == 0 and second.launch.blocks <= 132
     assert first.arguments.status == second.arguments.status != 0
     assert first.arguments.result == second.arguments.result != 0
@@ -73,26 +73,33 @@ def test_a_large_robot_takes_one_cooperative_launch() -> None:
     assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
 
 
-@pytest.mark.parametrize("batch", [1, 5])
-def test_a_robot_larger_than_the_card_has_threads(batch: int) -> None:
-    """They keep more particles each, so that all blocks of a team are resident."""
-    (one,) = launches(window(22_000), batch, card=Card(4, 101_376))
-    assert one.launch.blocks == one.arguments.team <= 4
-    assert one.arguments.team * one.kernel.threads * one.kernel.per_thread >= 22_000
+def test_many_large_robots_take_a_block_each() -> None:
+    """Whose threads keep no particles in registers; nodes are where a window holds most of them."""
+    first, second = launches(window(22_000), 64)
+    assert first.kernel.shared and first.kernel.per_thread == 0 and first.launch.blocks == 64
+    assert first.arguments.rows > plan.SMALLEST_WINDOW and second.launch.cooperative
+    assert second.kernel.per_thread == 0 and second.arguments.team == 22
 
 
-def test_two_bodies_take_teams() -> None:
-    (one,) = launches(replace(robot_and_ball(60, 30), backend="native"), 3)
-    assert one.launch.cooperative and (one.arguments.num_bodies, one.launch.blocks) == (2, 3)
+def test_a_robot_with_more_particles_than_the_card_has_threads() -> None:
+    (one,) = launches(window(22_000), card=Card(16, 101_376))
+    assert one.launch.blocks == one.arguments.team == 16 and one.kernel.per_thread == 0
 
 
-def test_double_precision_takes_a_block_where_its_nodes_fit() -> None:
-    on_h100 = launches(window(2000), dtype=torch.float64)
-    assert [one.kernel.shared for one in on_h100] == [True, False]
-    assert on_h100[0].arguments.rows >= plan.SMALLEST_WINDOW
-    assert [one.kernel.shared for one in launches(window(2000), dtype=torch.float64, card=RTX_4090)] == [False]
-    on_4090 = launches(window(2000), card=RTX_4090)
-    assert on_4090[0].kernel.shared and on_4090[0].launch.shared_bytes <= RTX_4090.shared_bytes
+def test_two_bodies_in_one_block() -> None:
+    """If a window holds both; if not, the device notices and the next launch takes them."""
+    first, second = launches(replace(robot_and_ball(2000, 300), backend="native"))
+    assert first.kernel.shared and first.arguments.num_bodies == 2 and first.kernel.per_thread == 0
+    assert not second.kernel.shared and second.arguments.status == first.arguments.status
+
+
+@pytest.mark.parametrize("card", [H100, RTX_4090])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_windows_are_as_large_as_the_memory_of_a_block(card: Card, dtype: torch.dtype) -> None:
+    first, second = launches(window(2000), dtype=dtype, card=card)
+    side, node = first.arguments.rows, first.kernel.node_bytes
+    assert first.kernel.shared and not second.kernel.shared and first.arguments.columns == side
+    assert first.launch.shared_bytes <= card.shared_bytes < first.launch.shared_bytes + 2 * (side + 1) * node
 
 
 def test_a_card_that_cannot_run_a_block() -> None:
