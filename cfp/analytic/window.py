@@ -20,6 +20,7 @@ from cfp.envs.vec_env import TorchVecEnv, first_limits
 from cfp.errors import NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv, core
+from dittogym.copies import to_host
 from dittogym.rewards import Reward, Transition
 from dittogym.spec import TaskSpec
 from torchmpm import tree
@@ -174,22 +175,24 @@ class Episodes(Resumable):
     def infos(self, done: Tensor) -> list[dict[str, Any]]:
         """Return and length of each episode that is ``done`` (B,), as stable-baselines3's ``Monitor`` reports them."""
         infos: list[dict[str, Any]] = [{} for _ in range(len(done))]
-        for i in done.nonzero()[:, 0].tolist():
-            infos[i]["episode"] = {"r": float(self.returns[i]), "l": int(self.env.env_state.steps[i])}
+        host = to_host({"done": done, "returns": self.returns, "steps": self.env.env_state.steps})
+        for i in np.flatnonzero(host["done"]).tolist():
+            infos[i]["episode"] = {"r": float(host["returns"][i]), "l": int(host["steps"][i])}
         return infos
 
     def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:
         """Start new episodes where ``done`` (B,), each on the next layout; count how they ended."""
         seeds = [0] * self.env.num_envs
-        for i in done.nonzero()[:, 0].tolist():
+        host = to_host({"done": done, "terminated": terminated, "finite": finite, "returns": self.returns})
+        for i in np.flatnonzero(host["done"]).tolist():
             self.counts["episodes"] += 1
-            self.counts["terminated"] += int(terminated[i])
-            self.counts["nonfinite"] += int(~finite[i])
-            self.recent_returns.append(float(self.returns[i]))
+            self.counts["terminated"] += int(host["terminated"][i])
+            self.counts["nonfinite"] += int(not host["finite"][i])
+            self.recent_returns.append(float(host["returns"][i]))
             seeds[i] = self.first_seed + self.num_started % self.num_layouts
             self.num_started += 1
-        if bool(done.any()):
-            self.env.reset(seed=seeds, options={"reset_mask": done})
+        if host["done"].any():
+            self.env.reset(seed=seeds, options={"reset_mask": host["done"]})
         self.returns = torch.where(done, 0.0, self.returns)
         self.limit = torch.where(done, self.max_steps, self.limit)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cfp.errors import NonFiniteError
 from dittogym import env as dittogym_env
+from dittogym.copies import to_device
 from dittogym.vector import autoreset_step
 from torchmpm import tree
 
@@ -47,9 +48,9 @@ class TorchVecEnv(VecEnv):
         self._actions: Tensor | None = None
         self._limits = self._first_limits()
 
-    def _first_limits(self) -> Tensor | None:
+    def _first_limits(self) -> np.ndarray | None:
         limit = self.max_episode_steps
-        return None if limit is None else first_limits(self.num_envs, limit, self.torch_env.device)
+        return None if limit is None else first_limits(self.num_envs, limit, torch.device("cpu")).numpy()
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
@@ -69,8 +70,8 @@ class TorchVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self._limits = self._first_limits()
-        self.reset_infos = self._split_info(info)
-        return _to_numpy(observation)
+        self.reset_infos = _split(dittogym_env.as_numpy(info))
+        return dittogym_env.as_numpy(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Set the actions (B, 2, R, R), float, of the next step.
@@ -80,7 +81,7 @@ class TorchVecEnv(VecEnv):
         """
         if not np.isfinite(actions).all():
             raise NonFiniteError("an action is not finite: the policy has diverged")
-        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.torch_env.device)
+        self._actions = to_device(np.array(actions, np.float32), self.torch_env.device)
 
     @torch.no_grad()
     def step_wait(self) -> VecEnvStepReturn:
@@ -88,27 +89,20 @@ class TorchVecEnv(VecEnv):
         assert self._actions is not None, "step_async must be called first"
         step = autoreset_step(self.torch_env, self._actions, self._limits)
         self._actions = None
-        if self._limits is not None and self.max_episode_steps is not None:
-            self._limits = torch.where(step.done, self.max_episode_steps, self._limits)
-        infos, done = self._split_info(step.info), _to_numpy(step.done)
-        if done.any():
-            finals, timed_out = _to_numpy(step.final_observation), _to_numpy(step.truncated)
-            for index in np.flatnonzero(done):
-                infos[index]["terminal_observation"] = finals[index]
-                infos[index]["TimeLimit.truncated"] = bool(timed_out[index])
-        return _to_numpy(step.observation), _to_numpy(step.reward.float()), done, infos
-
-    def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""
-        columns = {key: value.tolist() for key, value in dittogym_env.flat(info).items()}
-        return [{key: value[index] for key, value in columns.items()} for index in range(self.num_envs)]
+        if self._limits is not None:
+            self._limits[step.done] = self.max_episode_steps
+        infos = _split(step.info)
+        for index, image in step.finals.items():
+            infos[index]["terminal_observation"] = image
+            infos[index]["TimeLimit.truncated"] = bool(step.truncated[index])
+        return dittogym_env.as_numpy(step.observation), step.reward.astype(np.float32), step.done, infos
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
         return [value.detach().cpu().clone() for value in self._state()]
 
     def _state(self) -> list[Tensor]:
-        limits = [] if self._limits is None else [self._limits]
+        limits = [] if self._limits is None else [torch.from_numpy(self._limits)]
         return [*tree.leaves(self.torch_env.env_state), *limits]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
@@ -125,7 +119,7 @@ class TorchVecEnv(VecEnv):
         values = iter(state)
         self.torch_env.env_state = tree.map(lambda value: next(values).to(value), self.torch_env.env_state)
         if self._limits is not None:
-            self._limits = next(values).to(self._limits)
+            self._limits = next(values).numpy().copy()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """One picture, uint8 (512, 512, 3), per element."""
@@ -168,10 +162,10 @@ class TorchVecEnv(VecEnv):
         return [False for _ in self._indices(indices)]
 
 
-def _to_numpy(tensor: Tensor) -> np.ndarray:
-    """Copy a tensor, because the environment may reuse its memory."""
-    array: np.ndarray = tensor.detach().cpu().numpy().copy()
-    return array
+def _split(info: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Turn one dictionary of arrays with a leading B into B dictionaries of numbers."""
+    columns = [array.tolist() for array in info.values()]
+    return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
