@@ -12,7 +12,7 @@
 #include <random>
 #include <vector>
 
-#define KERNEL extern "C"
+#define KERNEL(blocks) extern "C"
 #define GRID_CONSTANT
 #define THREAD (imitation::self().thread)
 #define BLOCK (imitation::self().block->index)

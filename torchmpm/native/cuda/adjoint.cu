@@ -157,7 +157,7 @@ private:
     }
 };
 
-KERNEL void torchmpm_adjoint(const GRID_CONSTANT Arguments given) {
+KERNEL(1) void torchmpm_adjoint(const GRID_CONSTANT Arguments given) {
     const int blocks = TORCHMPM_SHARED ? 1 : int(given.team), team = BLOCK / blocks;
     Arena scratch{given.scratch + team * given.scratch_bytes};
     Robot robot = Robot::make<true>(given, scratch);

@@ -106,7 +106,7 @@ class Kernel(NamedTuple):
         """Dynamic shared memory of a block."""
         real = self.real_bytes
         pieces = [
-            3 * 4 * SUMMARY + 4 * real + 4 * SHARES * real,
+            3 * 4 * SUMMARY + 4 * SHARES * real,
             bodies * (24 + 13 * real),
             rules * (36 if real == 4 else 48),
         ]

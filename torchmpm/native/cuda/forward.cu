@@ -98,7 +98,10 @@ private:
     }
 };
 
-KERNEL void torchmpm_forward(const GRID_CONSTANT Arguments given) {
+// Teams have small blocks, which leave registers for a second one.
+constexpr int RESIDENT = !TORCHMPM_SHARED && sizeof(Real) == 4 && TORCHMPM_THREADS <= 256 ? 2 : 1;
+
+KERNEL(RESIDENT) void torchmpm_forward(const GRID_CONSTANT Arguments given) {
     const int blocks = TORCHMPM_SHARED ? 1 : int(given.team), team = BLOCK / blocks;
     Arena scratch{given.scratch + team * given.scratch_bytes};
     Robot robot = Robot::make<false>(given, scratch);

@@ -39,7 +39,8 @@ enum Atomic : int {
 #include "cuda_imitation.hpp"
 #else
 
-#define KERNEL extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS, 1)
+// With room for so many blocks on a multiprocessor.
+#define KERNEL(blocks) extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS, blocks)
 #define GRID_CONSTANT __grid_constant__
 #define THREAD int(threadIdx.x)
 #define BLOCK int(blockIdx.x)
@@ -51,11 +52,32 @@ INLINE char* shared_memory() {
     return memory;
 }
 
-template <Atomic> INLINE void add(int32_t* to, int32_t value) { atomicAdd(to, value); }
-template <Atomic> INLINE void add(int64_t* to, int64_t value) {
-    atomicAdd(reinterpret_cast<uint64_t*>(to), static_cast<uint64_t>(value));
+// In global memory with the instruction that returns nothing: in a kernel with a fence, compilers do not choose it for
+// atomicAdd by themselves.
+template <Atomic name> constexpr bool TO_GLOBAL = !TORCHMPM_SHARED && name != ADD_SHARE;
+#define ADD_TO_GLOBAL(type, letter, to, value)                                                                      \
+    asm volatile("red.relaxed.gpu.global.add." type " [%0], %1;" ::"l"(__cvta_generic_to_global(to)), letter(value) \
+                 : "memory")
+
+template <Atomic name> INLINE void add(int32_t* to, int32_t value) { atomicAdd(to, value); }
+template <Atomic name> INLINE void add(int64_t* to, int64_t value) {
+    if constexpr (TO_GLOBAL<name>)
+        ADD_TO_GLOBAL("u64", "l", to, value);
+    else
+        atomicAdd(reinterpret_cast<uint64_t*>(to), static_cast<uint64_t>(value));
 }
-template <Atomic> INLINE void add(Real* to, Real value) { atomicAdd(to, value); }
+template <Atomic name> INLINE void add(float* to, float value) {
+    if constexpr (TO_GLOBAL<name>)
+        ADD_TO_GLOBAL("f32", "f", to, value);
+    else
+        atomicAdd(to, value);
+}
+template <Atomic name> INLINE void add(double* to, double value) {
+    if constexpr (TO_GLOBAL<name>)
+        ADD_TO_GLOBAL("f64", "d", to, value);
+    else
+        atomicAdd(to, value);
+}
 template <Atomic> INLINE void raise(int* to, int value) { atomicMax(to, value); }
 template <Atomic> INLINE uint32_t count(uint32_t* counter) { return atomicAdd(counter, 1u); }
 // Numbers that other threads may be writing.
