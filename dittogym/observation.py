@@ -1,7 +1,7 @@
 """The observation (3, 64, 64): occupancy and velocity in the half metre around the robot, row 0 at the top.
 
-Drawn from particles, obstacles and goal in torch operations, or in one C++ function with the same bytes (of splats at
-most one off). Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
+Drawn from particles, obstacles and goal in torch operations, or in one C++ function or CUDA kernel with the same bytes (at
+most one off, of the C++ function only in splats). Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Camera:
     particle_weight: tuple[float, ...]  # By body, the full-size particles that one particle stands for
     hidden_velocity: tuple[bool, ...]  # By body, whether the velocity channels leave it out
     pixels: bool  # Whether each particle sets a pixel, as with full particle counts, instead of splats
-    native: bool  # Whether to draw in C++ where that is possible
+    native: bool  # Whether to draw in C++ or CUDA where that is possible
 
     def observe(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
