@@ -1,7 +1,7 @@
 """The observation (3, 64, 64): occupancy and velocity in the half metre around the robot, row 0 at the top.
 
-Drawn from particles, obstacles and goal in torch operations, or in one C++ function or CUDA kernel with the same bytes (at
-most one off, of the C++ function only in splats). Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
+Drawn from particles, obstacles and goal in torch operations, or in one C++ function or CUDA kernel, whose bytes are the
+same or one off. Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
 """
 
 from __future__ import annotations
