@@ -2,8 +2,8 @@
 #include "step.cuh"
 
 // The particles of a thread, which keeps them in registers, or, without a number of them per thread, in the result. It
-// keeps what a substep needs of the one before; v and C only pass through, so those of a particle that leaves the domain
-// go to the result at once.
+// keeps what a substep needs of the one before; v and C only pass through, so those of a particle that leaves the
+// domain go to the result at once.
 class Particles {
 public:
     INLINE explicit Particles(const Robot& robot) : robot(robot) {}
@@ -80,7 +80,8 @@ private:
         return {from[at(c, index)], from[at(c + 1, index)], from[at(c + 2, index)], from[at(c + 3, index)]};
     }
     INLINE Kept read(const Real* from, int index) const {
-        return {from[at(X, index)], from[at(Y, index)], read_matrix(from, F0, index), SNOW ? from[at(JP, index)] : Real(1)};
+        return {from[at(X, index)], from[at(Y, index)], read_matrix(from, F0, index),
+                SNOW ? from[at(JP, index)] : Real(1)};
     }
     INLINE void write_matrix(int c, int index, Mat2 m) const {
         Real* to = robot.given.result;

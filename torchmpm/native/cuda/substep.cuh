@@ -53,6 +53,33 @@ struct Record {
     Real *x, *y, *inverse;  // velocity before gravity, and one over the mass
 };
 
+// Two numbers of each node around a particle, for the sums of stencil.hpp.
+struct Around {
+    const Pair* first;
+    int columns;
+
+    INLINE Around(const Pair* nodes, const Window& window, const Place& at)
+        : first(nodes + window.at(at.i, at.j)), columns(window.columns) {}
+
+    INLINE Real operator()(int p, int q, int c) const {
+        const Pair node = first[p * columns + q];
+        return c ? node.y : node.x;
+    }
+};
+
+INLINE Moments read(const Pair* nodes, const Window& window, const Place& at) {
+    const auto wx = [&](int p) { return weight(at.fx, p); };
+    const auto wy = [&](int q) { return weight(at.fy, q); };
+    return gather(at.fx, at.fy, wx, wy, Around(nodes, window, at));
+}
+
+// Of the muscles of a particle.
+INLINE Pair actuation(const Robot& robot, const Body& body, const Place& at) {
+    if (!TORCHMPM_MUSCLES || !body.muscle) return {0, 0};
+    const Moments field = read(robot.nodes.field, robot.window, at);
+    return {field.value[0], field.value[1]};
+}
+
 class Substep {
 public:
     Robot& robot;
@@ -67,35 +94,12 @@ public:
     INLINE bool take(Particle& p) const {
         const Place at = locate(p);
         if (!at.on) return false;
-        const Pair* nodes = robot.nodes.velocity + before.at(at.i, at.j);
-        const Moments m = gather(
-            at.fx, at.fy, [&](int p) { return weight(at.fx, p); }, [&](int q) { return weight(at.fy, q); },
-            [&](int p, int q, int c) {
-                const Pair node = nodes[p * before.columns + q];
-                return c ? node.y : node.x;
-            });
+        const Moments m = read(robot.nodes.velocity, before, at);
         const Real slope = 4 * robot.domain.inverse_h;
         p.x += robot.dt * m.value[0], p.y += robot.dt * m.value[1];
         p.vx = m.value[0], p.vy = m.value[1];
         p.C = {slope * m.slope_x[0], slope * m.slope_y[0], slope * m.slope_x[1], slope * m.slope_y[1]};
         return true;
-    }
-
-    // Actuation at a particle.
-    INLINE Pair actuation(const Place& at) const {
-        Pair sum{0, 0};
-        const Pair* nodes = robot.nodes.field + robot.window.at(at.i, at.j);
-        three([&](int p) {
-            Pair across{0, 0};
-            three([&](int q) {
-                const Pair node = nodes[p * robot.window.columns + q];
-                const Real w = weight(at.fy, q);
-                across.x += w * node.x, across.y += w * node.y;
-            });
-            const Real w = weight(at.fx, p);
-            sum.x += w * across.x, sum.y += w * across.y;
-        });
-        return sum;
     }
 
     // P2G: deform, and give mass and momentum to the nodes; returns whether the particle takes part. `survey` gets
@@ -129,7 +133,7 @@ private:
 
     INLINE void give(Particle& p, const Place& at, int index, const Body& body, bool keep, Survey& survey) const {
         const Values m = robot.values_of(body, index);
-        const Pair act = TORCHMPM_MUSCLES && body.muscle ? actuation(at) : Pair{0, 0};
+        const Pair act = actuation(robot, body, at);
         Mat2 F = p.F;
         Real Jp = p.Jp;
         const Sym2 tau = deform_as(body.kind, m, body.bounds, p.C, act, F, Jp);
