@@ -19,6 +19,9 @@ from dittogym.copies import to_device
 from dittogym.vector import autoreset_step
 from torchmpm import tree
 
+#: What is wrong with actions that are not finite.
+DIVERGED = "an action is not finite: the policy has diverged"
+
 
 class TorchVecEnv(VecEnv):
     """Batched environment with same-step autoreset, as stable-baselines3 expects it.
@@ -33,6 +36,8 @@ class TorchVecEnv(VecEnv):
         max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
             After a reset of all elements, the first episode of element i is truncated after a fraction
             ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
+        tensors: Observations are tensors on the device, and so may actions be: of a GPU only numbers, and the last
+            images of episodes, are copied to the host.
     """
 
     def __init__(
@@ -40,12 +45,14 @@ class TorchVecEnv(VecEnv):
         env: Any,
         spaces: tuple[Space[Any], Space[Any]] | None = None,
         max_episode_steps: int | None = None,
+        tensors: bool = False,
     ) -> None:
-        self.torch_env = env
+        self.torch_env, self.tensors = env, tensors
         self.max_episode_steps = None if max_episode_steps is None else min(max_episode_steps, env.spec.horizon)
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None
+        self._are_finite: bool | Tensor = True  # these actions
         self._limits = self._first_limits()
 
     def _first_limits(self) -> np.ndarray | None:
@@ -57,7 +64,7 @@ class TorchVecEnv(VecEnv):
         """Start new episodes in all elements, with the seed and options set since the last reset.
 
         Returns:
-            uint8 (B, 3, 64, 64).
+            uint8 (B, 3, 64, 64), a tensor with ``tensors``.
 
         Raises:
             ValueError: The options are not one dictionary for all elements, see `dittogym.TorchEnv.reset`.
@@ -71,17 +78,25 @@ class TorchVecEnv(VecEnv):
         self._reset_options()
         self._limits = self._first_limits()
         self.reset_infos = _split(dittogym_env.as_numpy(info))
-        return dittogym_env.as_numpy(observation)
+        return self._as_returned(observation)
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """Set the actions (B, 2, R, R), float, of the next step.
+    def _as_returned(self, observation: Tensor) -> Any:
+        # A copy, because the environment may use its memory again.
+        return observation.clone() if self.tensors else dittogym_env.as_numpy(observation)
+
+    def step_async(self, actions: Any) -> None:
+        """Set the actions (B, 2, R, R), float, of the next step; with ``tensors`` they may be a tensor.
 
         Raises:
-            NonFiniteError: An action is NaN or infinite.
+            NonFiniteError: An action is NaN or infinite; of a tensor, ``step_wait`` raises it.
         """
+        if isinstance(actions, Tensor):
+            self._are_finite = actions.isfinite().all()
+            self._actions = torch.where(self._are_finite, actions, 0.0)
+            return
         if not np.isfinite(actions).all():
-            raise NonFiniteError("an action is not finite: the policy has diverged")
-        self._actions = to_device(np.array(actions, np.float32), self.torch_env.device)
+            raise NonFiniteError(DIVERGED)
+        self._actions, self._are_finite = to_device(np.array(actions, np.float32), self.torch_env.device), True
 
     @torch.no_grad()
     def step_wait(self) -> VecEnvStepReturn:
@@ -89,13 +104,15 @@ class TorchVecEnv(VecEnv):
         assert self._actions is not None, "step_async must be called first"
         step = autoreset_step(self.torch_env, self._actions, self._limits)
         self._actions = None
+        if not self._are_finite:  # on a GPU, which the step has waited for already
+            raise NonFiniteError(DIVERGED)
         if self._limits is not None:
             self._limits[step.done] = self.max_episode_steps
         infos = _split(step.info)
         for index, image in step.finals.items():
             infos[index]["terminal_observation"] = image
             infos[index]["TimeLimit.truncated"] = bool(step.truncated[index])
-        return dittogym_env.as_numpy(step.observation), step.reward.astype(np.float32), step.done, infos
+        return self._as_returned(step.observation), step.reward.astype(np.float32), step.done, infos
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
@@ -168,11 +185,16 @@ def _split(info: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
+def keeps_tensors(env: Any) -> bool:
+    """Whether a vectorised environment is, or wraps, a `TorchVecEnv` whose observations are tensors."""
+    return bool(getattr(getattr(env, "unwrapped", env), "tensors", False))
+
+
 def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
     """Steps (B,) after which the first episodes are truncated: a fraction ``(i + 1) / B`` of those of later ones."""
     return (torch.arange(1, num_envs + 1, device=device) * max_steps // num_envs).clamp(min=1)
 
 
-def monitored(env: Any, max_episode_steps: int | None = None) -> VecMonitor:
+def monitored(env: Any, max_episode_steps: int | None = None, tensors: bool = False) -> VecMonitor:
     """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
-    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps))
+    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps, tensors=tensors))
