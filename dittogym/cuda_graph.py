@@ -1,8 +1,8 @@
 """Replays a function of tensors as a CUDA graph: one launch in place of one for each of its operations.
 
 Recording runs the function on buffers that stay; a replay copies new arguments there, repeats what was launched, and
-copies the results out. So the function must launch the same for all arguments of the same sizes and must not look at
-numbers on the device.
+copies the results out. So the function must launch the same for all arguments of the same sizes, and not wait for
+numbers from the device.
 """
 
 from __future__ import annotations
@@ -141,7 +141,6 @@ class Recording:
         structure: pytree.TreeSpec,
         constants: Sequence[Tensor],
     ) -> None:
-        self.entries = entries = list(entries)  # all but tensors must stay what they are
         tensors = [entry for entry in entries if isinstance(entry, Tensor)]
         with torch.inference_mode(False), torch.no_grad():
             self.inputs = _copied(tensors)

@@ -1,7 +1,7 @@
 """The observation (3, 64, 64): occupancy and velocity in the half metre around the robot, row 0 at the top.
 
-Drawn from particles, obstacles and goal in torch operations, or in one C++ function with the same bytes (of splats at
-most one off). Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
+Drawn from particles, obstacles and goal in torch operations, or in one C++ function or CUDA kernel, whose bytes are the
+same or one off. Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Camera:
     particle_weight: tuple[float, ...]  # By body, the full-size particles that one particle stands for
     hidden_velocity: tuple[bool, ...]  # By body, whether the velocity channels leave it out
     pixels: bool  # Whether each particle sets a pixel, as with full particle counts, instead of splats
-    native: bool  # Whether to draw in C++ where that is possible
+    native: bool  # Whether to draw in C++ or CUDA where that is possible
 
     def observe(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
@@ -307,17 +307,17 @@ def splat_means(shown: RasterInput) -> Tensor:
 
 def _splat_weights(shown: RasterInput) -> tuple[Tensor, Tensor]:
     """Weights (B, 9, N) of the pixels around each particle, and their indices (B, 9 N) in the framed image."""
-    position, width = shown.position, SIZE + 2 * FRAME
-    u = position[..., 0] * (RASTER / BLOCK) - shown.column / BLOCK - 0.5
-    w = (1.0 - position[..., 1]) * (RASTER / BLOCK) - shown.row / BLOCK - 0.5
+    x, y = shown.position.unbind(-1)
+    corner, width = torch.stack((shown.column, shown.row)), SIZE + 2 * FRAME
+    at = torch.stack((x, 1.0 - y)) * (RASTER / BLOCK) - corner / BLOCK - 0.5  # (2, B, N) pixels rightwards, downwards
     middle, reach = 0.5 * SIZE, 0.5 * SIZE + 1.5
-    near = shown.visible & ((u - middle).abs() < reach) & ((w - middle).abs() < reach)
-    u, w = torch.where(near, u, 0.0), torch.where(near, w, 0.0)
-    base_u, base_w = torch.floor(u - 0.5), torch.floor(w - 0.5)
-    across = quadratic_weights(u - base_u) * (near * shown.weight)[:, None]
-    weight = (quadratic_weights(w - base_w)[:, :, None] * across[:, None]).flatten(1, 2)
-    first = ((base_w + FRAME) * width + base_u + FRAME).to(torch.int64)
-    offset = torch.arange(3, device=u.device)
+    near = shown.visible & ((at - middle).abs() < reach).all(0)
+    at = torch.where(near, at, 0.0)
+    base = torch.floor(at - 0.5)
+    across, along = quadratic_weights(at - base)
+    weight = (along[:, :, None] * (across * (near * shown.weight)[:, None])[:, None]).flatten(1, 2)
+    first = ((base[1] + FRAME) * width + base[0] + FRAME).to(torch.int64)
+    offset = torch.arange(3, device=at.device)
     ids = (first[:, None] + (offset[:, None] * width + offset).view(9, 1)).flatten(1)
     return weight, ids
 

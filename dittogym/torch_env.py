@@ -297,7 +297,8 @@ class TorchEnv:
 
         On a GPU it returns before the step is done, and does not wait for what only the device knows: an action that is
         not finite ends its element with :data:`dittogym.core.FAILURE_REWARD`, and the next reset, of any elements,
-        raises the error.
+        raises the error. Without gradients, the third step is recorded as a CUDA graph, which later steps replay; the
+        task's reward function is not part of it.
 
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values

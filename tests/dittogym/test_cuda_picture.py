@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import importlib.util
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import dittogym
 from dittogym import cuda_picture
 from dittogym.observation import cuda_drawing
 from torchmpm.backends import compiler_found
+from torchmpm.native.cuda import compiler
 from torchmpm.native.cuda.compiler import FOLDERS
 from torchmpm.native.cuda.driver import Launch
 from torchmpm.native.library import build
@@ -136,6 +138,16 @@ def test_barriers_and_atomic_operations_are_needed(pixels: bool, broken: dict[st
             return True
 
     assert any(map(noticed, range(20)))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["sm_80", "sm_89", "sm_90", "sm_120"])
+def test_it_compiles(arch: str) -> None:
+    kernel = cuda_picture.Kernel.of(torch.float32)
+    folder = compiler.path_of(kernel).parent
+    binary = compiler.compile_source(compiler.source_of(kernel), arch, kernel.macros, folder=folder)
+    assert binary.startswith(b"\x7fELF")
 
 
 def test_a_kernel_that_draws_something_else_is_not_used() -> None:
