@@ -69,13 +69,20 @@ cuda-kernels: $(CUDA_STAMP)  ## compile the CUDA kernels for all cards, and run 
 	@$(PYTHON) -c "import sys; print(*(p for p in sys.path if p.endswith('-packages')), sep='\n')" \
 		> $$(.venv-gpu/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/outside.pth
 	@.venv-gpu/bin/python -m pip install -qq --disable-pip-version-check $(if $(WHEELS),--no-index --find-links $(WHEELS)) \
-		$(PIP_FLAGS) -e ".[$$($(PYTHON) benchmarks/gpu.py --extra)]"
+		$(PIP_FLAGS) -e ".[$$($(PYTHON) benchmarks/gpu.py --extra)]" hypothesis pytest pytest-xdist
 	@touch $@
 
+HAS_GPU := -c "import sys, torch; sys.exit(not torch.cuda.is_available())" 2>/dev/null
+
 gpu:  ## checks, speed and trainings on a GPU in eight minutes; without one, tiny ones on an imitation of it
-	@if $(PYTHON) -c "import sys, torch; sys.exit(not torch.cuda.is_available())" 2>/dev/null; \
-	then $(MAKE) .venv-gpu/.stamp && .venv-gpu/bin/python benchmarks/gpu.py $(GPU_FLAGS); \
-	else $(MAKE) install && $(BIN)/python benchmarks/gpu.py $(GPU_FLAGS); fi
+	@$(PYTHON) -c "import torch" 2>/dev/null || $(MAKE) install
+	@for python in $(PYTHON) $(BIN)/python; do \
+		if $$python $(HAS_GPU); then \
+			$(MAKE) .venv-gpu/.stamp PYTHON=$$python || exit; \
+			exec .venv-gpu/bin/python benchmarks/gpu.py $(GPU_FLAGS); \
+		fi; \
+	done; \
+	$(MAKE) install && exec $(BIN)/python benchmarks/gpu.py $(GPU_FLAGS)
 
 # In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch
