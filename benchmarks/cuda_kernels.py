@@ -66,7 +66,7 @@ def rows(architectures: list[str]) -> Iterator[dict[str, str]]:
             "precision": "float32" if kernel.real == "float" else "float64",
             "first used by": scene,
             "nodes in": f"shared memory, {one.rows} × {one.columns}" if kernel.shared else "global memory",
-            "threads × particles": f"{kernel.threads} × {kernel.per_thread}",
+            "threads × particles": f"{kernel.threads} × {kernel.per_thread or 'any'}",
             "shared memory (KB)": f"{one.shared_bytes / 1024:.1f}",
         }
         for arch in architectures:

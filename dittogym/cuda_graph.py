@@ -47,8 +47,13 @@ class CudaGraph:
 
     def record(self, function: Callable[[], Result]) -> Result:
         """See :class:`Graph`."""
-        with torch.cuda.device(self._device), torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-            return function()
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream()
+            try:
+                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                    return function()
+            finally:
+                torch.cuda.set_stream(stream)  # torch stays on its own where the recording fails
 
     def replay(self) -> None:
         """See :class:`Graph`."""

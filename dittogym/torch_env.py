@@ -421,7 +421,8 @@ def find_substeps(dt: float, substeps: int | None) -> int:
     checks.number("dt", dt, above=0.0)
     if substeps is not None:
         return checks.whole("substeps", substeps, 1)
-    count = round(CONTROL_STEP / dt)
+    ratio = CONTROL_STEP / dt
+    count = round(ratio) if math.isfinite(ratio) else 0
     if not math.isclose(count * dt, CONTROL_STEP):
         raise ValueError(f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}")
     return count

@@ -1,6 +1,6 @@
 """Velocity rules on grid nodes: floors, ceilings, walls and boxes, from data.
 
-The native kernels have the same formulas in ``native/common/node.hpp`` and ``native/cuda/grid.py``.
+The native kernels have the same formulas in ``native/common/node.hpp``.
 """
 
 import math

@@ -373,7 +373,7 @@ def kernels_fail(device: torch.device, dtype: torch.dtype = torch.float32) -> st
                 end = step(start, field, origin=like.new_zeros(2, 2), substeps=5)
                 loss = end.x.square().sum() + end.v.square().sum() + end.F.square().sum()
                 found.append((end.x, end.v, end.F, *torch.autograd.grad(loss, (x, field))))
-    except (ValueError, RuntimeError) as error:  # they cannot be compiled, or not launched
+    except Exception as error:  # whatever is wrong with compiler, driver or card, eager still works
         return f"its kernels were tried on {device}, and failed: {error}"
     names = ("x", "v", "F", "the gradient in x", "the gradient in the field")
     for name, ours, theirs in zip(names, *found, strict=True):

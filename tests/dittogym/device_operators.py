@@ -34,8 +34,8 @@ class DeviceOperators:
     The tensors lie on the CPU, so code that asks for the device of a tensor takes another way than on CUDA. There are
     three such places around the physics: the observation, which the C++ function draws as the CUDA kernel does, in one
     call (that :attr:`launches` does not count); actions of a single simulation, so count with two or more; and the
-    check of actions, for which :attr:`dittogym.TorchEnv.device` is what matters. The physics is a call into C++, which
-    is not counted either.
+    check whether an action is finite, see ``on_a_gpu`` in test_device.py. The physics is a call into C++, which is not
+    counted either.
 
     Attributes:
         launches: Operators that launch a kernel or copy on the device.
@@ -66,7 +66,7 @@ class _Functions(TorchFunctionMode):
         self, func: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
-        host = str(kwargs.get("device")) == "cpu"  # asked for by name: stays on the host
+        host = isinstance(kwargs.get("device"), str)  # "cpu" by name stays on the host; else it is a tensor's device
         given = isinstance(args[0], Tensor) if args else False
         if func in DOWNLOADS or (func in UPLOADS and not host and not (given and func is torch.as_tensor)):
             self.record.waits[f"torch.{func.__name__}"] += 1

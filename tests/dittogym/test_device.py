@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -25,6 +26,40 @@ def on_a_gpu(env: TorchEnv) -> TorchEnv:
     """The environment with the check of actions that it has on a GPU, after steps that leave its constants there."""
     env._unread = torch.zeros((), dtype=env.dtype)
     return env
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: float(x.sum()),
+        lambda x: bool((x > 0).any()),
+        lambda x: x[x > 0],
+        lambda x: x.nonzero(),
+        lambda x: torch.equal(x, x),
+        lambda x: x.unique(),
+        lambda x: x.masked_select(x > 0),
+        lambda x: x.cpu(),
+        lambda x: x.tolist(),
+        lambda x: x.new_tensor([1.0]),
+        lambda x: torch.as_tensor(np.ones(2), device=x.device),
+        lambda x: torch.tensor([1.0], device=x.device),
+        lambda x: x.repeat_interleave(torch.ones_like(x).long()),
+        lambda x: x.clone().index_put_((x > 0,), x[0]),
+    ],
+)
+def test_what_would_wait_is_noticed(function: Callable[[torch.Tensor], object]) -> None:
+    with DeviceOperators() as seen:
+        function(torch.arange(4.0))
+    assert seen.waits
+
+
+def test_what_would_not_wait_is_only_counted() -> None:
+    x, index = torch.arange(4.0), torch.tensor([0, 2])
+    with DeviceOperators() as seen:
+        torch.where(x > 0, x[index].sum(), 1.0)[:2].view(1, 2)
+        torch.zeros(3, device=x.device)
+        torch.tensor([1.0], device="cpu")
+    assert not seen.waits and sum(seen.launches.values()) == 6
 
 
 @pytest.mark.parametrize("soft", [False, True])

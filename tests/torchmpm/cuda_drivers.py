@@ -51,8 +51,13 @@ class Recorder:
 class Imitation(Gpu):
     """The imitation of a GPU, with few libraries: one serves all materials and all numbers of particles."""
 
+    def card(self, device: torch.device) -> Card:
+        """Up to three robots are few."""
+        return Card(multiprocessors=32, shared_bytes=100_000)
+
     def load(self, kernel: Kernel, device: torch.device) -> tuple[ctypes.CDLL, Kernel]:
-        return super().load(kernel._replace(kinds=7, per_thread=max(kernel.per_thread, plan.PER_THREAD)), device)
+        per_thread = plan.PER_THREAD if kernel.per_thread > 0 else 0
+        return super().load(kernel._replace(kinds=7, per_thread=per_thread), device)
 
 
 @contextmanager
@@ -62,7 +67,9 @@ def in_use(driver: Driver) -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
         if isinstance(driver, Imitation):
             patch.setattr(plan, "SHARED_THREADS", 32)
+            patch.setattr(plan, "ADJOINT_THREADS", 32)
             patch.setattr(plan, "TEAM_THREADS", 32)
+            patch.setattr(plan, "SMALL", 40)
         patch.setattr(kernels, "forward", launcher.forward)
         patch.setattr(kernels, "backward", launcher.backward)
         yield driver

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from torchmpm.native.cuda.arguments import COMPONENTS, COUNTERS, Arguments, Kernel
@@ -17,12 +18,14 @@ from torchmpm.native.cuda.compiler import FOLDERS, digest_of_sources
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.cuda.launcher import Launcher
 from torchmpm.native.cuda.plan import Call, Pass
-from torchmpm.native.library import build, cache_folder
+from torchmpm.native.library import build, cache_folder, find_compiler
 from torchmpm.native.tables import BodyTable, RuleTable
 
 HERE = Path(__file__).with_name("imitation")
 #: Threads of a block, and particles that each of them keeps.
 THREADS, PER_THREAD = 32, 4
+#: Bytes beyond the scratch memory that must stay as they are.
+MARGIN = 4096
 
 
 class Broken(Exception):
@@ -57,23 +60,29 @@ class Gpu:
         """
         kernels, kernel = function
         assert isinstance(arguments, Arguments)
-        ctypes.memset(arguments.scratch, 0xCB, launch.blocks // arguments.team * arguments.scratch_bytes)
+        size = launch.blocks // arguments.team * arguments.scratch_bytes
+        scratch = ctypes.create_string_buffer(b"\xcb" * (size + MARGIN), size + MARGIN)
+        arguments.scratch = ctypes.addressof(scratch)
         if arguments.result and (kernel.shared or not arguments.status):
-            size = COMPONENTS * arguments.batch * arguments.particles * kernel.real_bytes
-            ctypes.memset(arguments.result, 0xFF, size)  # NaN where nothing is written
+            numbers = COMPONENTS * arguments.batch * arguments.particles
+            ctypes.memset(arguments.result, 0xFF, numbers * kernel.real_bytes)  # NaN where nothing is written
         outcome = kernels.launch(
             ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
             ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
         )  # fmt: skip
         if outcome:
             raise Broken(("threads diverged", "threads wait for ever", "shared memory is too small")[outcome - 1])
+        if scratch.raw[size:] != b"\xcb" * MARGIN:
+            raise Broken("scratch memory is too small")
 
 
 @functools.cache
 def library(shared: bool, real: str, threads: int, per_thread: int, kinds: int, muscles: bool) -> ctypes.CDLL:
     """The kernels of given properties, see :class:`torchmpm.native.cuda.arguments.Kernel`."""
     macros = Kernel(False, shared, real, threads, per_thread, kinds, muscles).macros
-    return build(HERE / "imitation.cpp", "-O1", *options(macros))
+    kernels = build(HERE / "imitation.cpp", "-O1", *options(macros))
+    assert kernels.bytes_of_arguments() == ctypes.sizeof(Arguments)
+    return kernels
 
 
 def options(macros: dict[str, str]) -> list[str]:
@@ -94,8 +103,10 @@ class Threads(Gpu):
         path = Path(cache_folder()) / f"threads-{hashlib.sha256(' '.join(flags).encode()).hexdigest()[:16]}"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            command = ["g++", *flags, str(HERE / "threads.cpp"), "-o", f"{path}-{os.getpid()}"]
-            subprocess.run(command, check=True, capture_output=True)
+            command = [*(find_compiler() or ()), *flags, str(HERE / "threads.cpp"), "-o", f"{path}-{os.getpid()}"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                pytest.skip(f"the compiler has no ThreadSanitizer: {done.stderr[-500:]}")
             os.replace(f"{path}-{os.getpid()}", path)
         return path, kernel.adjoint
 
@@ -113,6 +124,8 @@ class Threads(Gpu):
             address = getattr(arguments, name)
             content += struct.pack("q", size if address else 0) + (ctypes.string_at(address, size) if address else b"")
         done = subprocess.run([str(program)], input=content, capture_output=True, check=False)
+        if b"unexpected memory mapping" in done.stderr:
+            pytest.skip("this system's addresses are too random for ThreadSanitizer")
         if done.returncode:
             raise Broken(done.stderr.decode()[:4000])
 

@@ -19,7 +19,8 @@ from scenes import lively, normal, robot, robot_and_ball
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchmpm import Grid, Solver
+from torchmpm import Grid, ParticleState, Solver, backends
+from torchmpm.native import kernels
 from torchmpm.native.cuda import compiler, launcher, plan
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
@@ -54,7 +55,7 @@ def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
     assert first.kernel.threads * first.kernel.per_thread >= 2000
     assert not second.kernel.shared and second.launch.cooperative
     assert second.arguments.rows == second.arguments.columns == Grid(128).width
-    assert second.arguments.team * second.kernel.threads * second.kernel.per_thread >= 2000
+    assert second.kernel.per_thread == 0 and second.arguments.team == 2
     assert second.launch.blocks % second.arguments.team == 0 and second.launch.blocks <= 132
     assert first.arguments.status == second.arguments.status != 0
     assert first.arguments.result == second.arguments.result != 0
@@ -72,26 +73,33 @@ def test_a_large_robot_takes_one_cooperative_launch() -> None:
     assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
 
 
-@pytest.mark.parametrize("batch", [1, 5])
-def test_a_robot_larger_than_the_card_has_threads(batch: int) -> None:
-    """They keep more particles each, so that all blocks of a team are resident."""
-    (one,) = launches(window(22_000), batch, card=Card(4, 101_376))
-    assert one.launch.blocks == one.arguments.team <= 4
-    assert one.arguments.team * one.kernel.threads * one.kernel.per_thread >= 22_000
+def test_many_large_robots_take_a_block_each() -> None:
+    """Whose threads keep no particles in registers; nodes are where a window holds most of them."""
+    first, second = launches(window(22_000), 64)
+    assert first.kernel.shared and first.kernel.per_thread == 0 and first.launch.blocks == 64
+    assert first.arguments.rows > plan.SMALLEST_WINDOW and second.launch.cooperative
+    assert second.kernel.per_thread == 0 and second.arguments.team == 22
 
 
-def test_two_bodies_take_teams() -> None:
-    (one,) = launches(replace(robot_and_ball(60, 30), backend="native"), 3)
-    assert one.launch.cooperative and (one.arguments.num_bodies, one.launch.blocks) == (2, 3)
+def test_a_robot_with_more_particles_than_the_card_has_threads() -> None:
+    (one,) = launches(window(22_000), card=Card(16, 101_376))
+    assert one.launch.blocks == one.arguments.team == 16 and one.kernel.per_thread == 0
 
 
-def test_double_precision_takes_a_block_where_its_nodes_fit() -> None:
-    on_h100 = launches(window(2000), dtype=torch.float64)
-    assert [one.kernel.shared for one in on_h100] == [True, False]
-    assert on_h100[0].arguments.rows >= plan.SMALLEST_WINDOW
-    assert [one.kernel.shared for one in launches(window(2000), dtype=torch.float64, card=RTX_4090)] == [False]
-    on_4090 = launches(window(2000), card=RTX_4090)
-    assert on_4090[0].kernel.shared and on_4090[0].launch.shared_bytes <= RTX_4090.shared_bytes
+def test_two_bodies_in_one_block() -> None:
+    """If a window holds both; if not, the device notices and the next launch takes them."""
+    first, second = launches(replace(robot_and_ball(2000, 300), backend="native"))
+    assert first.kernel.shared and first.arguments.num_bodies == 2 and first.kernel.per_thread == 0
+    assert not second.kernel.shared and second.arguments.status == first.arguments.status
+
+
+@pytest.mark.parametrize("card", [H100, RTX_4090])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_windows_are_as_large_as_the_memory_of_a_block(card: Card, dtype: torch.dtype) -> None:
+    first, second = launches(window(2000), dtype=dtype, card=card)
+    side, node = first.arguments.rows, first.kernel.node_bytes
+    assert first.kernel.shared and not second.kernel.shared and first.arguments.columns == side
+    assert first.launch.shared_bytes <= card.shared_bytes < first.launch.shared_bytes + 2 * (side + 1) * node
 
 
 def test_a_card_that_cannot_run_a_block() -> None:
@@ -270,7 +278,7 @@ def compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str,
     """What NVRTC was asked for: architectures, and the precision."""
     asked: list[tuple[str, str]] = []
 
-    def compile_source(text: str, arch: str, macros: dict[str, str]) -> bytes:
+    def compile_source(text: str, arch: str, macros: dict[str, str], **_: object) -> bytes:
         asked.append((arch, macros["TORCHMPM_REAL"]))
         return f"binary {len(asked)}".encode()
 
@@ -350,3 +358,27 @@ class Zeros(Recorder):
     def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
         if arguments.result:
             ctypes.memset(arguments.result, 0, 4 * 13 * arguments.batch * arguments.particles)
+
+
+@pytest.mark.parametrize("reason", [None, "x differed"])
+def test_auto_on_a_gpu_follows_the_check(
+    reason: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And says why it is eager; whoever asks for the kernels gets them without it."""
+    asked: list[tuple[torch.device, torch.dtype]] = []
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: None)
+    monkeypatch.setattr("torchmpm.solver.kernels_fail", lambda *of: asked.append(of) or reason)
+    backends.warn_eager.cache_clear()
+    state, solver = lively(5), robot(5, backend="auto")
+    assert replace(solver, backend="native").runs_native(state) and not asked
+    assert solver.runs_native(state) == (reason is None) and asked == [(torch.device("cuda", 0), torch.float64)]
+    said = [record.message for record in caplog.records if record.name == "torchmpm.backends"]
+    assert not said if reason is None else "operator by operator" in said[0] and reason in said[0]
+
+
+def test_an_unavailable_gpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ParticleState, "device", torch.device("cuda", 0))
+    monkeypatch.setattr(kernels, "unavailable", lambda device: "on CUDA it needs cuda-core")
+    with pytest.raises(ValueError, match="backend 'native' cannot run this: on CUDA it needs cuda-core; use 'eager'"):
+        robot(5, backend="native").runs_native(lively(5))

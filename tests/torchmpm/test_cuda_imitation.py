@@ -152,6 +152,19 @@ def test_sizes(count: int, use: Callable[..., None]) -> None:
         assert_close(*(step(robot(count), b, lively(count, 2), field, substeps=2) for b in ("native", "eager")), 1e-12)
 
 
+def test_more_particles_than_registers(use: Callable[..., None]) -> None:
+    """Kept in memory they take the same steps, also where they leave the window or are outside of it."""
+    still = lively(COUNT, 2, corner=(0.75, 0.4))
+    state = replace(still, v=torch.tensor([5.0, 0.0]) + 0.0 * still.v, C=0.0 * still.C)
+    solver, field = robot(COUNT, rules=()), 40.0 * normal(2, 2, 16, 16, seed=1)
+    eager = step(solver, "eager", state, field, substeps=12)
+    moved = (eager.x - state.x).abs().amax(-1)
+    assert (moved == 0).any() and (moved.lt(0.005) & moved.gt(0)).any(), "some must be outside, some must leave"
+    for plan in (Plan(), Plan(sizes=(8, 0)), Plan(shared=False, team=2, teams=1)):
+        use(plan)
+        assert_close(step(solver, "native", state, field, substeps=12), eager, 1e-11)
+
+
 def test_without_muscles(use: Callable[..., None]) -> None:
     """Kernels that have none."""
     solver, given = robot(COUNT), state_leaves(COUNT, 2)

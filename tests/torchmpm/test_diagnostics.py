@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from scenes import GRID, lively, robot_and_ball
+from scenes import GRID, lively, normal, robot_and_ball
 
 from torchmpm import ParticleState, VelocityRule, diagnostics
 
@@ -89,3 +89,15 @@ def test_impulse_of_a_floor(state: ParticleState) -> None:
         torch.testing.assert_close(found, after - diagnostics.momentum(still, falling), rtol=0, atol=1e-6)
         assert (found[:, 1] > 0).all()
         assert (found[:, 0].abs() > 1.0).tolist() == [share[0] == 1.0] * 2
+
+
+def test_impulses_take_actuation_and_origin(state: ParticleState) -> None:
+    field = 60.0 * normal(2, 2, 16, 16, seed=1)
+    origin = torch.tensor([[0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)
+    found = diagnostics.impulses(SOLVER, state, field, origin)
+    change = diagnostics.momentum(SOLVER, SOLVER.step(state, field, origin=origin)) - diagnostics.momentum(
+        SOLVER, state
+    )
+    torch.testing.assert_close(sum(found.values()), change, rtol=1e-9, atol=1e-9)
+    plain = diagnostics.impulses(SOLVER, state)["boundary"]
+    assert not torch.allclose(found["boundary"], plain)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scenes import matrix, normal, planes
+from scenes import matrix, normal, planes, turn
 from torch import Tensor
 
 from torchmpm.materials import linalg
@@ -49,6 +49,37 @@ def test_polar_of_a_singular_matrix_is_a_rotation() -> None:
     """det = 0 counts as not inverted."""
     F = torch.tensor([[3.0, 0.0], [0.0, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(polar(F), torch.eye(2, dtype=torch.float64), rtol=0, atol=1e-15)
+
+
+POINTS = {
+    "identity": torch.eye(2, dtype=torch.float64),
+    "rotation": turn(2.0),
+    "stretch": torch.diag(torch.tensor([1.7, 1.7], dtype=torch.float64)),
+    "shear": torch.tensor([[1.0, 0.9], [0.1, 0.6]], dtype=torch.float64),
+    "reflection": torch.diag(torch.tensor([1.0, -1.0], dtype=torch.float64)),  # trace zero
+    "inverted": torch.tensor([[0.3, 1.1], [0.8, -0.2]], dtype=torch.float64),
+}
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_gradient_of_the_polar_factor(name: str) -> None:
+    F = POINTS[name].clone().requires_grad_()
+    assert torch.autograd.gradcheck(polar, (F,), atol=1e-8)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("small", [1e-3, 1e-8, 1e-15])
+def test_gradient_beside_singular_matrices_is_bounded(small: float, sign: float) -> None:
+    """The reference's rule for det F < 0: without it an inverted F with trace near zero has gradients of 1e14."""
+    for angle in (0.0, 0.7, 2.9):
+        F = (turn(angle) @ torch.diag(torch.tensor([1.0, sign * small], dtype=torch.float64))).requires_grad_()
+        jacobian = torch.autograd.functional.jacobian(polar, F)
+        assert jacobian.abs().max() <= 2.0
+
+
+def test_gradient_at_zero_is_finite() -> None:
+    F = torch.zeros(2, 2, requires_grad=True)
+    assert torch.autograd.functional.jacobian(polar, F).isfinite().all()
 
 
 @given(MATRIX, MATRIX)

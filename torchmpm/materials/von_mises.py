@@ -1,6 +1,6 @@
 """Von Mises plasticity in principal logarithmic strains, the robot material of DittoGym (Huang et al., 2024).
 
-The native kernels have the same formulas in ``native/common/material.hpp`` and ``native/cuda/material.py``.
+The native kernels have the same formulas in ``native/common/material.hpp``.
 """
 
 import math

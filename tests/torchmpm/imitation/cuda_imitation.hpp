@@ -1,6 +1,6 @@
-// The machine of torchmpm/native/cuda/machine.cuh on one CPU thread. Each CUDA thread is a fibre with a stack of its own; a
-// fibre runs until it comes to a barrier or waits for another block, and then a random one of those that can go on does.
-// So whatever order of threads the kernels rely on without a barrier is broken sooner or later. Compiled with
+// The machine of torchmpm/native/cuda/machine.cuh on one CPU thread. Each CUDA thread is a fibre with a stack of its
+// own; a fibre runs until it comes to a barrier or waits for another block, and then a random one of those that can go
+// on does. So whatever order of threads the kernels rely on without a barrier is broken sooner or later. Compiled with
 // TORCHMPM_REAL_THREADS, each CUDA thread is a thread of the system instead, for ThreadSanitizer.
 #pragma once
 #include <cmath>
@@ -17,7 +17,6 @@
 #define THREAD (imitation::self().thread)
 #define BLOCK (imitation::self().block->index)
 #define BLOCKS (imitation::machine().blocks())
-#define WARP 1  // a thread is a warp
 #define BARRIER(name) imitation::barrier(name)
 
 namespace imitation {
@@ -58,13 +57,12 @@ template <Atomic name> uint32_t count(uint32_t* counter) {
 template <class Number> Number look(Number* at) { return imitation::look(at); }
 template <class Number> void mark(Number* at) { imitation::mark(at); }
 inline void fence() {}
-inline int largest_of_warp(int value) { return value; }
 
 // As on a GPU, numbers that are too large become the largest integer, and NaN becomes 0.
 template <class Integer> void round_to(Real value, Integer& to) {
     constexpr Real end = Real(std::numeric_limits<Integer>::max());
-    to = value >= end ? std::numeric_limits<Integer>::max()
-         : value <= -end ? std::numeric_limits<Integer>::min()
+    to = value >= end     ? std::numeric_limits<Integer>::max()
+         : value <= -end  ? std::numeric_limits<Integer>::min()
          : value == value ? Integer(std::llrint(value))
                           : 0;
 }

@@ -8,7 +8,7 @@
 #include "forward.cu"
 
 int main() {
-        const auto number = [&] {
+    const auto number = [&] {
         int64_t value;
         std::cin.read(reinterpret_cast<char*>(&value), sizeof value);
         return value;
@@ -23,7 +23,8 @@ int main() {
         memory[k].resize(number());
         std::cin.read(memory[k].data(), memory[k].size());
         const void* address = memory[k].empty() ? nullptr : memory[k].data();
-        std::memcpy(reinterpret_cast<char*>(&given) + offsetof(Arguments, bodies) + k * sizeof address, &address, sizeof address);
+        std::memcpy(reinterpret_cast<char*>(&given) + offsetof(Arguments, bodies) + k * sizeof address, &address,
+                    sizeof address);
     }
     imitation::Machine machine{TORCHMPM_THREADS};
     machine.kernel = [=] { adjoint ? torchmpm_adjoint(given) : torchmpm_forward(given); };

@@ -12,13 +12,14 @@ struct DeformedBar {
 };
 
 // Adjoint of `deform`, from the derivatives in its results.
-template <Kind kind>
-INLINE DeformedBar deform_adjoint(Real dt, const Values& m, const Bounds& bounds, Mat2 C, Mat2 F, Real Jp, Real act_x,
-                                  Real act_y, Mat2 affine_bar, Mat2 F_bar, Real Jp_bar) {
+template <Kind kind> INLINE DeformedBar deform_adjoint(Real dt, const Values& m, const Bounds& bounds, Mat2 C, Mat2 F,
+                                                       Real Jp, Real act_x, Real act_y, Mat2 affine_bar, Mat2 F_bar,
+                                                       Real Jp_bar) {
     const Mat2 grown = growth(dt, C), trial = matmul(grown, F);
     Sym2 S;
-    const MaterialBar out = material_adjoint<kind>(m, bounds, trial, Jp, act_x, act_y,
-                                                   {affine_bar.a, affine_bar.b + affine_bar.c, affine_bar.d}, F_bar, Jp_bar, S);
+    const MaterialBar out =
+        material_adjoint<kind>(m, bounds, trial, Jp, act_x, act_y,
+                               {affine_bar.a, affine_bar.b + affine_bar.c, affine_bar.d}, F_bar, Jp_bar, S);
     return {m.mass * affine_bar + dt * matmul(F_bar, transposed(F)),
             matmul(transposed(grown), F_bar),
             Jp_bar,
@@ -33,10 +34,10 @@ INLINE bool unresolved(const Bounds& bounds, Mat2 C) {
 
 // Factors of what a particle reads from the nodes and gives to them, for the derivative in its position.
 struct PositionFactors {
-    Real mass, mvx, mvy;      // mass and momentum
-    Real vx_bar, vy_bar;      // derivatives in the velocity that it reads, with that of the position
-    Mat2 C_bar, affine;       // derivative in the affine matrix that it reads, affine momentum; both per cell
-    Real act_x, act_y;        // derivatives in the actuation
+    Real mass, mvx, mvy;  // mass and momentum
+    Real vx_bar, vy_bar;  // derivatives in the velocity that it reads, with that of the position
+    Mat2 C_bar, affine;   // derivative in the affine matrix that it reads, affine momentum; both per cell
+    Real act_x, act_y;    // derivatives in the actuation
 };
 
 struct PositionBar {
@@ -44,11 +45,11 @@ struct PositionBar {
     Real mass;    // sum of the weighted derivatives in the masses of the nodes
 };
 
-// Through all weights and offsets of a substep. `velocity`, `momentum_bar` and `field` are called with (p, q, c) for number
-// c of node (p, q), `mass_bar` with (p, q).
+// Through all weights and offsets of a substep. `velocity`, `momentum_bar` and `field` are called with (p, q, c) for
+// number c of node (p, q), `mass_bar` with (p, q).
 template <bool muscles, class WeightX, class WeightY, class Velocity, class MomentumBar, class MassBar, class Field>
-INLINE PositionBar position_adjoint(Real fx, Real fy, WeightX wx, WeightY wy, const PositionFactors& f, Velocity velocity,
-                                    MomentumBar momentum_bar, MassBar mass_bar, Field field) {
+INLINE PositionBar position_adjoint(Real fx, Real fy, WeightX wx, WeightY wy, const PositionFactors& f,
+                                    Velocity velocity, MomentumBar momentum_bar, MassBar mass_bar, Field field) {
     PositionBar sum = {0, 0, 0};
     three([&](int p) {
         Real row = 0, row_slope = 0, row_x = 0, row_y = 0, row_mass = 0;

@@ -4,7 +4,9 @@
 
 // Quadratic B-spline: weight of node p of three, counted from the first, at f cells from the first, and its derivative.
 INLINE Real weight(Real f, int p) {
-    return p == 0 ? Real(0.5) * square(Real(1.5) - f) : p == 1 ? Real(0.75) - square(f - 1) : Real(0.5) * square(f - Real(0.5));
+    return p == 0   ? Real(0.5) * square(Real(1.5) - f)
+           : p == 1 ? Real(0.75) - square(f - 1)
+                    : Real(0.5) * square(f - Real(0.5));
 }
 INLINE Real weight_slope(Real f, int p) { return p == 0 ? f - Real(1.5) : p == 1 ? 2 - 2 * f : f - Real(0.5); }
 

@@ -6,6 +6,6 @@ many blocks, and ``launcher`` does it through ``driver``.
 
 A block of threads takes one simulation through all substeps of a step in one launch: particles stay in registers, and
 the nodes around them in shared memory. Simulations that do not fit there are taken by several blocks each, with the
-nodes in global memory. Masses and momenta are added as integers, so that their order makes no difference: forward
-results are the same in every run, and do not depend on what else is in the batch.
+nodes in global memory; so are a few large ones. Masses and momenta are added as integers, so that their order makes no
+difference: forward results are the same in every run.
 """

@@ -1,10 +1,10 @@
-// The adjoint kernel: replays the substeps of a step onto a tape, then goes back through them. Particles are streamed from
-// the tape, and their derivatives are kept where the result will be, so that a thread may have any number of them.
+// The adjoint kernel: replays the substeps of a step onto a tape, then goes back through them. Particles are streamed
+// from the tape, and their derivatives are kept where the result will be, so that a thread may have any number of them.
 #include "reverse.cuh"
 #include "step.cuh"
 
-// The particles of a thread during the replay. Their state at the start of substep s is complete when it begins; F and Jp,
-// which the substep before deforms, are there already.
+// The particles of a thread during the replay. Their state at the start of substep s is complete when it begins; F and
+// Jp, which the substep before deforms, are there already.
 struct Streamed {
     const Robot& robot;
     const Tape& tape;
@@ -24,7 +24,9 @@ struct Streamed {
         for (int index = robot.team.rank; index < robot.given.particles; index += robot.team.size) f(index);
     }
 
-    INLINE Particle at_start_of(int substep, int index) const { return read([&](int c) { return tape.state(substep, c, index); }); }
+    INLINE Particle at_start_of(int substep, int index) const {
+        return read([&](int c) { return tape.state(substep, c, index); });
+    }
 
     INLINE Particle given(int index) const { return from(robot.given.components, index); }
 
@@ -47,17 +49,26 @@ private:
 
     // What changes at the end of a substep, and what in its course.
     INLINE void moved(int substep, int index, const Particle& p) const {
-        write([&](int c, Real value) { if (c < F0) tape.state(substep, c, index) = value; }, p);
+        write(
+            [&](int c, Real value) {
+                if (c < F0) tape.state(substep, c, index) = value;
+            },
+            p);
     }
     INLINE void deformed(int substep, int index, const Particle& p) const {
-        write([&](int c, Real value) { if (c >= F0) tape.state(substep, c, index) = value; }, p);
+        write(
+            [&](int c, Real value) {
+                if (c >= F0) tape.state(substep, c, index) = value;
+            },
+            p);
     }
 
     template <class Read> INLINE static Particle read(Read c) {
         return {c(X), c(Y), c(VX), c(VY), {c(C0), c(C1), c(C2), c(C3)}, {c(F0), c(F1), c(F2), c(F3)}, c(JP)};
     }
     template <class Write> INLINE static void write(Write put, const Particle& p) {
-        const Real all[COMPONENTS] = {p.x, p.y, p.vx, p.vy, p.C.a, p.C.b, p.C.c, p.C.d, p.F.a, p.F.b, p.F.c, p.F.d, p.Jp};
+        const Real all[COMPONENTS] = {p.x,   p.y,   p.vx,  p.vy,  p.C.a, p.C.b, p.C.c,
+                                      p.C.d, p.F.a, p.F.b, p.F.c, p.F.d, p.Jp};
 #pragma unroll
         for (int c = 0; c < COMPONENTS; ++c) put(c, all[c]);
     }
@@ -113,11 +124,12 @@ private:
         const int64_t nodes = 2 * given.resolution * given.resolution;
         for (int k = robot.team.rank; k < nodes; k += robot.team.size) given.field_bar[robot.element * nodes + k] = 0;
         if (TORCHMPM_MUSCLES)
-            for (int k = robot.team.rank; k < robot.window.nodes(); k += robot.team.size) robot.nodes.field_bar[k] = {0, 0};
+            for (int k = robot.team.rank; k < robot.window.nodes(); k += robot.team.size)
+                robot.nodes.field_bar[k] = {0, 0};
     }
 
-    // The particles at the end of the adjoint of substep `s`, and at the beginning of that of the one before, whose window
-    // is given.
+    // The particles at the end of the adjoint of substep `s`, and at the beginning of that of the one before, whose
+    // window is given.
     INLINE void back(int s, const Window& window) {
         const bool last = s == robot.given.substeps;
         Streamed::for_own(robot, [&](int index) {

@@ -8,7 +8,10 @@ a robot in shared memory or in global memory.
   not fit the window, or whose numbers leave the range of the fixed-point sums, is given up: its ``status`` is not 0.
 - **Global**: ``team`` blocks advance one robot together, on nodes in their scratch memory. They wait for each other, so
   all blocks must be resident: launch cooperatively, ``team`` times any number of teams. With ``status``, they take the
-  robots that the kernel before gave up. With forward kernels, ``team * threads * per_thread`` particles must suffice.
+  robots that the kernel before gave up.
+
+A forward kernel keeps ``per_thread`` particles of each thread in registers, so ``team * threads * per_thread`` must
+suffice; with 0 it keeps them in the result, as many as there are. So does an adjoint kernel, on its tape, in any case.
 
 The launcher never needs to look at the status: it launches the global kernel after the shared one on the same stream.
 """
@@ -58,7 +61,7 @@ class Kernel(NamedTuple):
     shared: bool  # nodes in shared memory
     real: str  # "float" or "double"
     threads: int  # of a block
-    per_thread: int  # particles that a thread keeps in registers; the adjoint takes any number
+    per_thread: int  # particles that a thread keeps in registers, 0: any number in global memory
     kinds: int  # bit k is set if a body has material KINDS[k]
     muscles: bool  # whether there is a field and a body with muscles
 

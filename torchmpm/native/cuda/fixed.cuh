@@ -1,11 +1,11 @@
-// Mass and momentum of nodes as integers, whose sums do not depend on the order of additions: results are the same bit for
-// bit in every run. Shared memory adds integers of 32 bits natively, while floating-point numbers take a loop of
+// Mass and momentum of nodes as integers, whose sums do not depend on the order of additions: results are the same bit
+// for bit in every run. Shared memory adds integers of 32 bits natively, while floating-point numbers take a loop of
 // compare-and-swap there; global memory adds integers of 64 bits as fast as any.
 //
-// The unit of mass follows the heaviest node, and the unit of momentum the fastest particle, both of the substep before.
-// With V at least the speed that a particle lends to any of its nodes, |w q| / unit of momentum <= w m / unit of mass:
-// where the mass of a node is rounded to nothing, so is its momentum, and no velocity is larger than V. Particles that
-// are faster than this range are not added, see Substep::give.
+// The unit of mass follows the heaviest node, and the unit of momentum the fastest particle, both of the substep
+// before. With V at least the speed that a particle lends to any of its nodes, |w q| / unit of momentum <= w m / unit
+// of mass: where the mass of a node is rounded to nothing, so is its momentum, and no velocity is larger than V.
+// Particles that are faster than this range are not added, see Substep::give.
 #pragma once
 #include "machine.cuh"
 
@@ -18,12 +18,12 @@ template <> struct FixedOf<true> {
 };
 using Fixed = FixedOf<WIDE>::type;
 
-// A node holds up to 2^RANGE units of mass. Weights of a particle in the outermost half cell are negative for some nodes,
-// which takes the remaining bit.
+// A node holds up to 2^RANGE units of mass. Weights of a particle in the outermost half cell are negative for some
+// nodes, which takes the remaining bit.
 constexpr int RANGE = WIDE ? 62 : 30;
-// How much faster the fastest particle and heavier the heaviest node may become within a substep. What leaves the range in
-// shared memory starts again in global memory. There, what becomes faster than that counts as not finite: from rest, that is
-// more than a cell per substep.
+// How much faster the fastest particle and heavier the heaviest node may become within a substep. What leaves the range
+// in shared memory starts again in global memory. There, what becomes faster than that counts as not finite: from rest,
+// that is more than a cell per substep.
 constexpr Real FASTER = TORCHMPM_SHARED ? Real(2) : sizeof(Real) == 8 ? Real(64) : Real(1 << 20);
 constexpr Real HEAVIER = TORCHMPM_SHARED ? Real(1.5) : sizeof(Real) == 8 ? Real(2) : Real(16);
 // As many particles as a node may have before anything is known about it.

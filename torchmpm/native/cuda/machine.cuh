@@ -39,12 +39,11 @@ enum Atomic : int {
 #include "cuda_imitation.hpp"
 #else
 
-#define KERNEL extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS)
+#define KERNEL extern "C" __global__ __launch_bounds__(TORCHMPM_THREADS, 1)
 #define GRID_CONSTANT __grid_constant__
 #define THREAD int(threadIdx.x)
 #define BLOCK int(blockIdx.x)
 #define BLOCKS int(gridDim.x)
-#define WARP 32
 #define BARRIER(name) __syncthreads()
 
 INLINE char* shared_memory() {
@@ -65,18 +64,12 @@ template <class Number> INLINE void mark(Number* at) { *at = 1; }
 // Orders what a thread wrote before an atomic operation with what others read after they saw it.
 INLINE void fence() { __threadfence(); }
 
-// The largest of the values of a warp's threads.
-INLINE int largest_of_warp(int value) {
-#if __CUDA_ARCH__ >= 800
-    return __reduce_max_sync(0xffffffffu, value);
-#else
-    for (int other = WARP / 2; other > 0; other /= 2) value = max(value, __shfl_xor_sync(0xffffffffu, value, other));
-    return value;
-#endif
-}
-
 // The nearest integer.
-INLINE void round_to(Real value, int32_t& to) { to = sizeof(Real) == 4 ? __float2int_rn(float(value)) : __double2int_rn(value); }
-INLINE void round_to(Real value, int64_t& to) { to = sizeof(Real) == 4 ? __float2ll_rn(float(value)) : __double2ll_rn(value); }
+INLINE void round_to(Real value, int32_t& to) {
+    to = sizeof(Real) == 4 ? __float2int_rn(float(value)) : __double2int_rn(value);
+}
+INLINE void round_to(Real value, int64_t& to) {
+    to = sizeof(Real) == 4 ? __float2ll_rn(float(value)) : __double2ll_rn(value);
+}
 
 #endif

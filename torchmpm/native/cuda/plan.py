@@ -7,12 +7,16 @@ from torchmpm.grid import PAD
 from torchmpm.native.cuda.arguments import Kernel
 from torchmpm.native.cuda.driver import Card
 
-#: Threads of a block with the nodes of a robot in shared memory, and of the blocks that share a robot.
-SHARED_THREADS, TEAM_THREADS = 512, 256
-#: Particles that a thread keeps in registers without spilling them.
+#: Threads of a block with the nodes of a robot in shared memory, forward and in the adjoint, and of the blocks that
+#: share a robot. More of them would spill registers, in double precision more than half as many.
+SHARED_THREADS, ADJOINT_THREADS, TEAM_THREADS = 512, 384, 256
+#: Particles that a thread keeps in registers without spilling them. Of more, it keeps none there.
 PER_THREAD = 4
-#: Sides of windows in shared memory: a robot of the tasks needs more than the smaller, and none the larger.
-SMALLEST_WINDOW, LARGEST_WINDOW = 48, 64
+#: Side of a window in shared memory below which no robot would fit.
+SMALLEST_WINDOW = 16
+#: Robots of up to so many particles get a block each. So do larger ones that keep this share of a card busy: additions
+#: in shared memory are so much faster that the rest of it may be idle. Estimates, which no card has confirmed yet.
+SMALL, BUSY = 4096, 1 / 8
 
 
 class Call(NamedTuple):
@@ -31,8 +35,12 @@ class Call(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Nodes of the whole window along an axis."""
+        """Nodes of the whole grid along an axis."""
         return self.resolution + 2 * PAD
+
+    def are_few(self, card: Card) -> bool:
+        """Whether a block for each robot would leave most of the card idle."""
+        return self.batch < BUSY * card.multiprocessors
 
 
 class Pass(NamedTuple):
@@ -62,15 +70,16 @@ def passes(call: Call, card: Card, resident: Resident) -> list[Pass]:
 
 
 def shared_pass(call: Call, card: Card, resident: Resident) -> Pass | None:
-    """One block for each robot, with its nodes in shared memory; ``None`` for those that do not fit there.
+    """One block for each robot, with its nodes in shared memory; ``None`` where blocks had better share a robot.
 
-    Two bodies can be far apart, and a window that follows both would be as large as the whole grid.
+    The window is as large as the memory allows: two bodies may be far apart. Robots that do not fit are given up before
+    their first substep.
     """
-    per_thread = -(-call.particles // SHARED_THREADS)
-    if call.bodies > 1 or per_thread > PER_THREAD:
+    if call.are_few(card) and call.particles > SMALL:
         return None
-    kernel = _kernel(call, shared=True, threads=SHARED_THREADS, per_thread=per_thread)
-    for side in range(min(call.width, LARGEST_WINDOW), min(call.width, SMALLEST_WINDOW) - 1, -1):
+    threads = (ADJOINT_THREADS if call.adjoint else SHARED_THREADS) // (2 if call.real == "double" else 1)
+    kernel = _kernel(call, shared=True, threads=threads, per_thread=-(-call.particles // threads))
+    for side in range(call.width, min(call.width, SMALLEST_WINDOW) - 1, -1):
         size = kernel.shared_bytes(side, side, call.bodies, call.rules)
         if size <= card.shared_bytes:
             scratch = kernel.scratch_bytes(side, side, call.resolution, call.particles, call.substeps)
@@ -82,23 +91,24 @@ def shared_pass(call: Call, card: Card, resident: Resident) -> Pass | None:
 def team_pass(call: Call, card: Card, resident: Resident) -> Pass:
     """Several blocks for each robot, with its nodes in global memory.
 
-    Where there are few robots, more blocks share one: each thread has one particle.
+    Where there are few robots, and the card has as many threads, each has one particle, which it keeps in registers.
     """
-    few = call.batch * -(-call.particles // TEAM_THREADS) <= card.multiprocessors
-    per_thread = 1 if few else PER_THREAD
-    while True:
-        team = -(-call.particles // (TEAM_THREADS * per_thread))
+    few, width = call.are_few(card), call.width
+    team = -(-call.particles // (TEAM_THREADS if few else TEAM_THREADS * PER_THREAD))
+    for per_thread in (1, 0) if few else (0,):
         kernel = _kernel(call, shared=False, threads=TEAM_THREADS, per_thread=per_thread)
-        size = kernel.shared_bytes(call.width, call.width, call.bodies, call.rules)
+        size = kernel.shared_bytes(width, width, call.bodies, call.rules)
         blocks = _at_least_one(kernel, resident(kernel, size))
         if team <= blocks:
             break
-        per_thread *= 2  # beyond the registers, but it runs
-    scratch = kernel.scratch_bytes(call.width, call.width, call.resolution, call.particles, call.substeps)
-    return Pass(kernel, call.width, call.width, team, min(call.batch, blocks // team), size, scratch)
+    team = min(team, blocks)
+    scratch = kernel.scratch_bytes(width, width, call.resolution, call.particles, call.substeps)
+    return Pass(kernel, width, width, team, min(call.batch, blocks // team), size, scratch)
 
 
 def _kernel(call: Call, *, shared: bool, threads: int, per_thread: int) -> Kernel:
+    if call.adjoint or per_thread > PER_THREAD:
+        per_thread = 0  # any number
     return Kernel(call.adjoint, shared, call.real, threads, per_thread, call.kinds, call.muscles)
 
 

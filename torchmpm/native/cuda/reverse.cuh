@@ -1,5 +1,5 @@
-// The adjoint of a substep. Going back, one pass over the particles ends the adjoint of a substep and begins that of the
-// one before, as on the CPU.
+// The adjoint of a substep. Going back, one pass over the particles ends the adjoint of a substep and begins that of
+// the one before, as on the CPU.
 #pragma once
 #include "node_adjoint.hpp"
 #include "particle_adjoint.hpp"
@@ -32,19 +32,18 @@ public:
         });
     }
 
-    // Adjoint of P2G and of the weights of both transfers: turns the derivatives in the state after the substep into those
-    // in the state before it.
+    // Adjoint of P2G and of the weights of both transfers: turns the derivatives in the state after the substep into
+    // those in the state before it.
     INLINE void take(const Particle& state, Particle& bar, int index, int body_index) {
         const Body& body = robot.bodies[body_index];
         const Place at = locate(robot.domain, state.x, state.y);
         if (at.on) {
-            const bool muscles = TORCHMPM_MUSCLES && body.muscle;
             if (has_kind<Kind::von_mises>(body.kind))
-                take_as<Kind::von_mises>(state, bar, at, body, index, muscles);
+                take_as<Kind::von_mises>(state, bar, at, body, index);
             else if (has_kind<Kind::snow>(body.kind))
-                take_as<Kind::snow>(state, bar, at, body, index, muscles);
+                take_as<Kind::snow>(state, bar, at, body, index);
             else
-                take_as<Kind::elastic>(state, bar, at, body, index, muscles);
+                take_as<Kind::elastic>(state, bar, at, body, index);
         }
         if (has_kind<Kind::snow>(body.kind) && unresolved(body.bounds, state.C)) bar = {};
     }
@@ -73,58 +72,43 @@ public:
     }
 
 private:
-    // Reads numbers of the nodes around a particle.
-    struct Around {
-        const Pair* first;
-        int columns;
-
-        INLINE Real operator()(int p, int q, int c) const {
-            const Pair node = first[p * columns + q];
-            return c ? node.y : node.x;
-        }
-    };
-
     template <Kind kind>
-    INLINE void take_as(const Particle& state, Particle& bar, const Place& at, const Body& body, int index, bool muscles) {
+    INLINE void take_as(const Particle& state, Particle& bar, const Place& at, const Body& body, int index) {
         const Values m = robot.values_of(body, index);
-        const int first = robot.window.at(at.i, at.j), columns = robot.window.columns;
         const Real dt = robot.dt, h = robot.h, slope = 4 * robot.domain.inverse_h;
-        const Around velocity{robot.nodes.velocity + first, columns}, momentum_bar{robot.nodes.momentum_bar + first, columns};
-        const Around field{robot.nodes.field + first, columns};
-        const auto wx = [&](int p) { return weight(at.fx, p); };
-        const auto wy = [&](int q) { return weight(at.fy, q); };
-        const Moments P = gather(at.fx, at.fy, wx, wy, momentum_bar);
+        const Nodes& nodes = robot.nodes;
+        const Window& window = robot.window;
+        const Moments P = read(nodes.momentum_bar, window, at);
         const Mat2 P_bar = h * Mat2{P.slope_x[0], P.slope_y[0], P.slope_x[1], P.slope_y[1]};
-        Pair act{0, 0};
-        if (muscles) {
-            const Moments moments = gather(at.fx, at.fy, wx, wy, field);
-            act = {moments.value[0], moments.value[1]};
-        }
-        const DeformedBar out = deform_adjoint<kind>(dt, m, body.bounds, state.C, state.F, state.Jp, act.x, act.y, P_bar,
-                                                     bar.F, bar.Jp);
-        const PositionFactors factors{m.mass,
-                                      m.mass * state.vx,
-                                      m.mass * state.vy,
-                                      bar.vx + dt * bar.x,
-                                      bar.vy + dt * bar.y,
-                                      slope * bar.C,
-                                      h * out.affine,
-                                      out.material.act_x,
-                                      out.material.act_y};
-        const Real* masses = robot.nodes.mass_bar + first;
-        const auto mass_bar = [&](int p, int q) { return masses[p * columns + q]; };
-        const auto acting = [&](int p, int q, int c) { return muscles ? field(p, q, c) : Real(0); };
-        const PositionBar sum = position_adjoint<TORCHMPM_MUSCLES>(at.fx, at.fy, wx, wy, factors, velocity, momentum_bar,
-                                                                   mass_bar, acting);
+        const Pair act = actuation(robot, body, at);
+        const DeformedBar out =
+            deform_adjoint<kind>(dt, m, body.bounds, state.C, state.F, state.Jp, act.x, act.y, P_bar, bar.F, bar.Jp);
+        const PositionFactors factors{
+            m.mass,        m.mass * state.vx, m.mass * state.vy,  bar.vx + dt * bar.x, bar.vy + dt * bar.y,
+            slope * bar.C, h * out.affine,    out.material.act_x, out.material.act_y};
+        const Real* masses = nodes.mass_bar + window.at(at.i, at.j);
+        const Around field(nodes.field, window, at);
+        const PositionBar sum = position_adjoint<TORCHMPM_MUSCLES>(
+            at.fx, at.fy, [&](int p) { return weight(at.fx, p); }, [&](int q) { return weight(at.fy, q); }, factors,
+            Around(nodes.velocity, window, at), Around(nodes.momentum_bar, window, at),
+            [&](int p, int q) { return masses[p * window.columns + q]; },
+            [&](int p, int q, int c) { return body.muscle ? field(p, q, c) : Real(0); });
         const Real x = sum.fx * robot.domain.inverse_h, y = sum.fy * robot.domain.inverse_h;
         origin_bar[0] -= x, origin_bar[1] -= y;
-        bar = {bar.x + x, bar.y + y, m.mass * P.value[0], m.mass * P.value[1], out.C, out.F, kind == Kind::snow ? out.Jp : bar.Jp};
+        bar = {bar.x + x,
+               bar.y + y,
+               m.mass * P.value[0],
+               m.mass * P.value[1],
+               out.C,
+               out.F,
+               kind == Kind::snow ? out.Jp : bar.Jp};
         if (robot.given.values_bar) {
-            const Real mass = state.vx * P.value[0] + state.vy * P.value[1] + P_bar.a * state.C.a + P_bar.b * state.C.b +
-                              P_bar.c * state.C.c + P_bar.d * state.C.d + sum.mass;
+            const Real mass = state.vx * P.value[0] + state.vy * P.value[1] + P_bar.a * state.C.a +
+                              P_bar.b * state.C.b + P_bar.c * state.C.c + P_bar.d * state.C.d + sum.mass;
             add_values(index, mass, out.material.values);
         }
-        if (muscles && robot.given.field_bar) scatter_actuation(at, first, out.material.act_x, out.material.act_y);
+        if (TORCHMPM_MUSCLES && body.muscle && robot.given.field_bar)
+            scatter_actuation(at, out.material.act_x, out.material.act_y);
     }
 
     INLINE void add_values(int index, Real mass, const Values& bar) const {
@@ -135,11 +119,12 @@ private:
         for (int r = 0; r < VALUES; ++r) to[r * stride] += of[r];
     }
 
-    INLINE void scatter_actuation(const Place& at, int first, Real x, Real y) const {
+    INLINE void scatter_actuation(const Place& at, Real x, Real y) const {
+        Pair* first = robot.nodes.field_bar + robot.window.at(at.i, at.j);
         three([&](int p) {
             three([&](int q) {
                 const Real w = weight(at.fx, p) * weight(at.fy, q);
-                Pair* node = robot.nodes.field_bar + first + p * robot.window.columns + q;
+                Pair* node = first + p * robot.window.columns + q;
                 add<ADD_FIELD_BAR_X>(&node->x, w * x);
                 add<ADD_FIELD_BAR_Y>(&node->y, w * y);
             });
@@ -153,10 +138,10 @@ private:
         velocity_bar = {0, 0};
         NodeBar out{{0, 0}, 0};
         if (robot.exists(i, j)) {
-            const Real raw[2] = {tape.x[node], tape.y[node]}, damping = Real(robot.given.damping);
-            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * damping;
+            const Real raw[2] = {tape.x[node], tape.y[node]};
+            for (int c = 0; c < 2; ++c) v[c] = (raw[c] + robot.gain[c]) * robot.damping;
             constrain_adjoint(robot.rules, robot.codes[i * robot.width() + j], v, bar);
-            for (int c = 0; c < 2; ++c) bar[c] *= damping, gain_bar[c] += bar[c];
+            for (int c = 0; c < 2; ++c) bar[c] *= robot.damping, gain_bar[c] += bar[c];
             out = node_adjoint(bar, raw, tape.inverse[node]);
         }
         robot.nodes.velocity[node] = {v[0], v[1]};

@@ -37,7 +37,8 @@ struct TeamMemory {
     int summary[3][SUMMARY];
 };
 
-// Nodes around a robot: all of the padded grid in global memory, or a window of it in shared memory that follows the robot.
+// Nodes around a robot: all of the padded grid in global memory, or a window of it in shared memory that follows the
+// robot.
 struct Window {
     int rows, columns;
     int i, j;  // its first node on the padded grid
@@ -61,14 +62,21 @@ INLINE int follow(int first, int size, int low, int high, int width) {
     return middle < 0 ? 0 : middle < last ? middle : last;
 }
 
+// What particles add up on a node, in fixed point. Side by side, so that all sums of a row of nodes have addresses at
+// fixed distances.
+struct Sums {
+    Fixed mass, x, y;
+#if !TORCHMPM_SHARED
+    Fixed spoilt;  // not 0 where something not finite was to be added
+#endif
+};
+
 // Numbers of the nodes. Those of the adjoint lie where the sums of the forward pass were.
 struct Nodes {
     Pair* velocity;
     Pair* field;      // actuation
     Pair* field_bar;  // derivative in it
-    Fixed* mass;
-    Fixed* momentum;  // two a node
-    Fixed* spoilt;    // not 0 where something not finite was added; only in global memory
+    Sums* sums;
     Pair* velocity_bar;
     Pair* momentum_bar;
     Real* mass_bar;
@@ -93,9 +101,7 @@ template <bool adjoint> INLINE Nodes lay_out(char* memory, int count) {
     nodes.velocity = pairs, pairs += count;
     if (TORCHMPM_MUSCLES) nodes.field = pairs, pairs += count;
     if (TORCHMPM_MUSCLES && adjoint) nodes.field_bar = pairs, pairs += count;
-    Fixed* sums = reinterpret_cast<Fixed*>(pairs);
-    nodes.mass = sums, nodes.momentum = sums + count;
-    if (!TORCHMPM_SHARED) nodes.spoilt = sums + 3 * count;
+    nodes.sums = reinterpret_cast<Sums*>(pairs);
     if (adjoint) {
         nodes.velocity_bar = pairs, nodes.momentum_bar = pairs + count;
         nodes.mass_bar = reinterpret_cast<Real*>(pairs + 2 * count);
@@ -112,9 +118,10 @@ public:
     BlockRule* rules;
     uint32_t* codes;  // rules of each node of the padded grid
     Nodes nodes;
-    Window window;    // of the sums that are being added up
+    Window window;  // of the sums that are being added up
     Domain domain;
-    Real dt, h, gain[2];  // gain: velocity from gravity in a substep
+    Real dt, h, damping, mass_epsilon;
+    Real gain[2];  // velocity from gravity in a substep
     int64_t element = 0;
 
     template <bool adjoint> INLINE static Robot make(const Arguments& given, Arena& scratch) {
@@ -128,6 +135,8 @@ public:
         robot.bodies = memory.take<Body>(given.num_bodies);
         robot.rules = memory.take<BlockRule>(given.num_rules);
         team.own = robot.shared->summary;
+        robot.dt = Real(given.dt), robot.h = Real(given.h);
+        robot.damping = Real(given.damping), robot.mass_epsilon = Real(given.mass_epsilon);
         robot.codes = scratch.take<uint32_t>(square_of(robot.width()));
         robot.window = {int(given.rows), int(given.columns), 0, 0};
         char* nodes = memory.next;
@@ -148,16 +157,15 @@ public:
     // Begin with another robot: all that is the same during a step.
     INLINE void prepare(int64_t which) {
         element = which;
-        dt = Real(given.dt), h = Real(given.h);
         domain = {given.origin[2 * element], given.origin[2 * element + 1], Real(1 / given.h), Real(given.margin),
-                  Real(given.extent), int(given.resolution)};
+                  Real(given.extent),        int(given.resolution)};
         for (int axis = 0; axis < 2; ++axis) gain[axis] = dt * given.gravity[2 * element + axis];
         window.i = window.j = 0;
         for (int substep = -2; substep < 1; ++substep) team.clear(substep);
         for (int k = THREAD; k < given.num_bodies; k += TORCHMPM_THREADS) bodies[k] = body(given.bodies[k]);
         for (int k = THREAD; k < given.num_rules; k += TORCHMPM_THREADS) rules[k] = rule(given.rules[k]);
         for (int k = THREAD; k < 4 * SHARES; k += TORCHMPM_THREADS) shared->shares[k / SHARES][k % SHARES] = 0;
-        for (int k = team.rank; k < (TORCHMPM_SHARED ? 3 : 4) * window.nodes(); k += team.size) nodes.mass[k] = 0;
+        for (int k = team.rank; k < window.nodes(); k += team.size) nodes.sums[k] = {};
         team.wait<PREPARED>();
         find_rules();
     }
@@ -199,7 +207,7 @@ private:
     INLINE static int64_t square_of(int64_t n) { return n * n; }
 
     template <bool adjoint> INLINE static size_t node_bytes() {
-        size_t sums = (TORCHMPM_SHARED ? 3 : 4) * sizeof(Fixed);
+        size_t sums = sizeof(Sums);
         if (adjoint && sums < 5 * sizeof(Real)) sums = 5 * sizeof(Real);
         return sums + sizeof(Pair) * (TORCHMPM_MUSCLES ? adjoint ? 3 : 2 : 1);
     }
@@ -224,7 +232,7 @@ private:
     }
 
     // Ends of ranges may be infinite, and far away.
-    INLINE static int whole(double end) { return int(end < -(1 << 28) ? -(1 << 28) : end > (1 << 28) ? 1 << 28 : end); }
+    INLINE static int whole(double end) { return int(end<-(1 << 28) ? -(1 << 28) : end>(1 << 28) ? 1 << 28 : end); }
 
     INLINE static BlockRule rule(const RuleTable& table) {
         BlockRule rule;

@@ -1,4 +1,4 @@
-// All substeps of a step, for particles that a thread keeps in registers (forward) or streams from a tape (adjoint).
+// All substeps of a step, for the particles of the forward kernel or those that the adjoint streams from its tape.
 #pragma once
 #include "substep.cuh"
 
@@ -9,18 +9,22 @@ struct NoTape {
     INLINE void note(int, const Robot&) const {}
 };
 
-// `particles.each(substep, f)` calls f(particle, index, body) for each particle of a thread. Returns why the robot must be
-// given up; all threads of the team call this together.
-template <class Particles, class Tape> INLINE int advance(Robot& robot, Substep& substep, Particles& particles, const Tape& tape) {
+// `particles.each(substep, f)` calls f(particle, index, body) for each particle of a thread; f returns whether the
+// particle leaves the domain with this substep, or is outside from the beginning: it will not take part again, as the
+// domain does not move during a step. Returns why the robot must be given up; all threads of the team call this
+// together.
+template <class Particles, class Tape>
+INLINE int advance(Robot& robot, Substep& substep, Particles& particles, const Tape& tape) {
     const Team& team = robot.team;
     const int substeps = int(robot.given.substeps);
     // Before the first substep, find where the particles are, then the heaviest node and the fastest particle.
     Survey start;
     particles.each(-2, [&](Particle& p, int index, int body) {
         const Place at = substep.locate(p);
-        if (!at.on) return;
+        if (!at.on) return false;
         start.include(at.i, at.j);
         start.heavy(robot.values_of(robot.bodies[body], index).mass);
+        return false;
     });
     start.join_particles(team, -2), start.join_masses(team, -2);
     team.wait_and_summarise<SURVEYED>(-2);
@@ -31,8 +35,8 @@ template <class Particles, class Tape> INLINE int advance(Robot& robot, Substep&
     for (int s = -1; s < substeps; ++s) {
         Survey survey;
         particles.each(s, [&](Particle& p, int index, int body) {
-            if (s > 0) substep.take(p);
-            substep.give(p, index, body, s >= 0, survey);
+            const bool takes_part = s <= 0 || substep.take(p);
+            return takes_part && !substep.give(p, index, body, s >= 0, survey) && s >= 0;
         });
         survey.join_particles(team, s);
         team.wait_and_summarise<GIVEN>(s);

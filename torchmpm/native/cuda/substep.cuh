@@ -53,6 +53,33 @@ struct Record {
     Real *x, *y, *inverse;  // velocity before gravity, and one over the mass
 };
 
+// Two numbers of each node around a particle, for the sums of stencil.hpp.
+struct Around {
+    const Pair* first;
+    int columns;
+
+    INLINE Around(const Pair* nodes, const Window& window, const Place& at)
+        : first(nodes + window.at(at.i, at.j)), columns(window.columns) {}
+
+    INLINE Real operator()(int p, int q, int c) const {
+        const Pair node = first[p * columns + q];
+        return c ? node.y : node.x;
+    }
+};
+
+INLINE Moments read(const Pair* nodes, const Window& window, const Place& at) {
+    const auto wx = [&](int p) { return weight(at.fx, p); };
+    const auto wy = [&](int q) { return weight(at.fy, q); };
+    return gather(at.fx, at.fy, wx, wy, Around(nodes, window, at));
+}
+
+// Of the muscles of a particle.
+INLINE Pair actuation(const Robot& robot, const Body& body, const Place& at) {
+    if (!TORCHMPM_MUSCLES || !body.muscle) return {0, 0};
+    const Moments field = read(robot.nodes.field, robot.window, at);
+    return {field.value[0], field.value[1]};
+}
+
 class Substep {
 public:
     Robot& robot;
@@ -63,65 +90,29 @@ public:
 
     INLINE Place locate(const Particle& p) const { return ::locate(robot.domain, p.x, p.y); }
 
-    // G2P.
-    INLINE void take(Particle& p) const {
+    // G2P; returns whether the particle takes part.
+    INLINE bool take(Particle& p) const {
         const Place at = locate(p);
-        if (!at.on || !before.holds(at.i, at.j)) return;
-        const Pair* nodes = robot.nodes.velocity + before.at(at.i, at.j);
-        const Moments m = gather(
-            at.fx, at.fy, [&](int p) { return weight(at.fx, p); }, [&](int q) { return weight(at.fy, q); },
-            [&](int p, int q, int c) {
-                const Pair node = nodes[p * before.columns + q];
-                return c ? node.y : node.x;
-            });
+        if (!at.on) return false;
+        const Moments m = read(robot.nodes.velocity, before, at);
         const Real slope = 4 * robot.domain.inverse_h;
         p.x += robot.dt * m.value[0], p.y += robot.dt * m.value[1];
         p.vx = m.value[0], p.vy = m.value[1];
         p.C = {slope * m.slope_x[0], slope * m.slope_y[0], slope * m.slope_x[1], slope * m.slope_y[1]};
+        return true;
     }
 
-    // Actuation at a particle.
-    INLINE Pair actuation(const Place& at) const {
-        Pair sum{0, 0};
-        const Pair* nodes = robot.nodes.field + robot.window.at(at.i, at.j);
-        three([&](int p) {
-            Pair across{0, 0};
-            three([&](int q) {
-                const Pair node = nodes[p * robot.window.columns + q];
-                const Real w = weight(at.fy, q);
-                across.x += w * node.x, across.y += w * node.y;
-            });
-            const Real w = weight(at.fx, p);
-            sum.x += w * across.x, sum.y += w * across.y;
-        });
-        return sum;
-    }
-
-    // P2G: deform, and give mass and momentum to the nodes. `survey` gets where the particle is and how fast; `keep` is
-    // false for a trial without effect on the particle.
-    INLINE void give(Particle& p, int index, int body_index, bool keep, Survey& survey) const {
+    // P2G: deform, and give mass and momentum to the nodes; returns whether the particle takes part. `survey` gets
+    // where it is and how fast; `keep` is false for a trial without effect on the particle.
+    INLINE bool give(Particle& p, int index, int body_index, bool keep, Survey& survey) const {
         const Place at = locate(p);
-        if (!at.on) return;
+        if (!at.on) return false;
         survey.include(at.i, at.j);
-        if (!robot.window.holds(at.i, at.j)) return survey.fail(LEFT_WINDOW);
-        const Body& body = robot.bodies[body_index];
-        const Values m = robot.values_of(body, index);
-        const Pair act = TORCHMPM_MUSCLES && body.muscle ? actuation(at) : Pair{0, 0};
-        Mat2 F = p.F;
-        Real Jp = p.Jp;
-        const Sym2 tau = deform_as(body.kind, m, body.bounds, p.C, act, F, Jp);
-        if (keep) p.F = F, p.Jp = Jp;
-        const Real h = robot.h, mvx = m.mass * p.vx, mvy = m.mass * p.vy;
-        const Real xx = h * affine_momentum(m, tau.xx, p.C.a), xy = h * affine_momentum(m, tau.xy, p.C.b);
-        const Real yx = h * affine_momentum(m, tau.xy, p.C.c), yy = h * affine_momentum(m, tau.yy, p.C.d);
-        // Nodes are at most two cells away from a particle along each axis.
-        const Real most_x = math::fabs(mvx) + 2 * (math::fabs(xx) + math::fabs(xy));
-        const Real most_y = math::fabs(mvy) + 2 * (math::fabs(yx) + math::fabs(yy));
-        const Real speed = (most_x > most_y ? most_x : most_y) / m.mass;
-        // The comparisons also fail for NaN.
-        if (!(speed <= scale.fastest) || !(most_x <= scale.fastest * m.mass)) return spoil(at, survey);
-        survey.fast(speed);
-        scatter(at, scale.mass * m.mass, scale.momentum, {mvx, mvy, xx, xy, yx, yy});
+        if (robot.window.holds(at.i, at.j))
+            give(p, at, index, robot.bodies[body_index], keep, survey);
+        else
+            survey.fail(LEFT_WINDOW);
+        return true;
     }
 
     // Nodes: from mass and momentum to velocity.
@@ -140,6 +131,26 @@ private:
         Real x, y, xx, xy, yx, yy;  // momentum, and its change per cell
     };
 
+    INLINE void give(Particle& p, const Place& at, int index, const Body& body, bool keep, Survey& survey) const {
+        const Values m = robot.values_of(body, index);
+        const Pair act = actuation(robot, body, at);
+        Mat2 F = p.F;
+        Real Jp = p.Jp;
+        const Sym2 tau = deform_as(body.kind, m, body.bounds, p.C, act, F, Jp);
+        if (keep) p.F = F, p.Jp = Jp;
+        const Real h = robot.h, mvx = m.mass * p.vx, mvy = m.mass * p.vy;
+        const Real xx = h * affine_momentum(m, tau.xx, p.C.a), xy = h * affine_momentum(m, tau.xy, p.C.b);
+        const Real yx = h * affine_momentum(m, tau.xy, p.C.c), yy = h * affine_momentum(m, tau.yy, p.C.d);
+        // Nodes are at most two cells away from a particle along each axis.
+        const Real most_x = math::fabs(mvx) + 2 * (math::fabs(xx) + math::fabs(xy));
+        const Real most_y = math::fabs(mvy) + 2 * (math::fabs(yx) + math::fabs(yy));
+        const Real speed = (most_x > most_y ? most_x : most_y) / m.mass;
+        // The comparisons also fail for NaN.
+        if (!(speed <= scale.fastest) || !(most_x <= scale.fastest * m.mass)) return spoil(at, survey);
+        survey.fast(speed);
+        scatter(at, scale.mass * m.mass, scale.momentum, {mvx, mvy, xx, xy, yx, yy});
+    }
+
     INLINE Sym2 deform_as(int kind, const Values& m, const Bounds& bounds, Mat2 C, Pair act, Mat2& F, Real& Jp) const {
         const Real dt = robot.dt;
         if (has_kind<Kind::von_mises>(kind)) return deform<Kind::von_mises>(dt, m, bounds, C, act.x, act.y, F, Jp);
@@ -150,50 +161,56 @@ private:
     // In shared memory the robot is given up, and starts again with wider sums in global memory.
     INLINE void spoil(const Place& at, Survey& survey) const {
         if (TORCHMPM_SHARED) return survey.fail(LEFT_RANGE);
-        const int first = robot.window.at(at.i, at.j);
-        three([&](int p) {
-            three([&](int q) { mark(robot.nodes.spoilt + first + p * robot.window.columns + q); });
-        });
+#if !TORCHMPM_SHARED
+        Sums* row = robot.nodes.sums + robot.window.at(at.i, at.j);
+        for (int p = 0; p < 3; ++p, row += robot.window.columns)
+            for (int q = 0; q < 3; ++q) mark(&row[q].spoilt);
+#endif
     }
 
     INLINE void scatter(const Place& at, Real mass, Real scaling, Impulse in) const {
-        const int first = robot.window.at(at.i, at.j), columns = robot.window.columns;
-        Fixed *masses = robot.nodes.mass + first, *momenta = robot.nodes.momentum + 2 * first;
         const Real xx = scaling * in.xx, xy = scaling * in.xy, yx = scaling * in.yx, yy = scaling * in.yy;
-        const Real x = scaling * in.x - xx * at.fx - xy * at.fy, y = scaling * in.y - yx * at.fx - yy * at.fy;
+        // Momentum on the first node of a row, then on the next ones.
+        Real first_x = scaling * in.x - xx * at.fx - xy * at.fy, first_y = scaling * in.y - yx * at.fx - yy * at.fy;
+        Sums* row = robot.nodes.sums + robot.window.at(at.i, at.j);
         three([&](int p) {
+            Real x = first_x, y = first_y;
             three([&](int q) {
                 const Real w = weight(at.fx, p) * weight(at.fy, q);
-                const int node = p * columns + q;
-                add<ADD_MASS>(masses + node, fixed(w * mass));
-                add<ADD_MOMENTUM_X>(momenta + 2 * node, fixed(w * (x + p * xx + q * xy)));
-                add<ADD_MOMENTUM_Y>(momenta + 2 * node + 1, fixed(w * (y + p * yx + q * yy)));
+                add<ADD_MASS>(&row[q].mass, fixed(w * mass));
+                add<ADD_MOMENTUM_X>(&row[q].x, fixed(w * x));
+                add<ADD_MOMENTUM_Y>(&row[q].y, fixed(w * y));
+                x += xy, y += yy;
             });
+            first_x += xx, first_y += yx, row += robot.window.columns;
         });
     }
 
     template <bool record> INLINE void move_node(int i, int j, Survey& survey, const Record& tape) const {
         const int node = robot.window.at(i, j);
-        Fixed &mass_sum = robot.nodes.mass[node], *momentum_sum = robot.nodes.momentum + 2 * node;
-        Real mass = scale.mass_unit * Real(mass_sum);
-        Real momentum[2] = {scale.momentum_unit * Real(momentum_sum[0]), scale.momentum_unit * Real(momentum_sum[1])};
-        constexpr Fixed most = Fixed(1) << RANGE;
-        const bool spoilt = mass_sum > most || mass_sum < -most || (!TORCHMPM_SHARED && robot.nodes.spoilt[node] != 0);
-        mass_sum = momentum_sum[0] = momentum_sum[1] = 0;
-        if (TORCHMPM_SHARED && spoilt) survey.fail(LEFT_RANGE);
-        if (!TORCHMPM_SHARED) robot.nodes.spoilt[node] = 0;
+        const Sums sums = robot.nodes.sums[node];
+        robot.nodes.sums[node] = {};
+        Real mass = scale.mass_unit * Real(sums.mass);
+        Real momentum[2] = {scale.momentum_unit * Real(sums.x), scale.momentum_unit * Real(sums.y)};
         survey.heavy(math::fabs(mass));
+        constexpr Fixed most = Fixed(1) << RANGE;
+        bool spoilt = sums.mass > most || sums.mass < -most;
+#if TORCHMPM_SHARED
+        if (spoilt) survey.fail(LEFT_RANGE);
+#else
+        spoilt |= sums.spoilt != 0;
+#endif
         if (spoilt) mass = momentum[0] = momentum[1] = not_a_number();
         // Where the mass has been rounded to nothing, so has the momentum.
-        const Real inverse = mass != 0 ? inverse_mass(mass, Real(robot.given.mass_epsilon)) : Real(0);
-        const Real damping = Real(robot.given.damping);
+        const Real inverse = mass != 0 ? inverse_mass(mass, robot.mass_epsilon) : Real(0);
         Real v[2] = {0, 0};
         if (robot.exists(i, j)) {
-            for (int c = 0; c < 2; ++c) v[c] = node_velocity(momentum[c], inverse, robot.gain[c], damping);
+            for (int c = 0; c < 2; ++c) v[c] = node_velocity(momentum[c], inverse, robot.gain[c], robot.damping);
             constrain(robot.rules, robot.codes[i * robot.width() + j], v);
         }
         robot.nodes.velocity[node] = {v[0], v[1]};
-        if (record) tape.x[node] = momentum[0] * inverse, tape.y[node] = momentum[1] * inverse, tape.inverse[node] = inverse;
+        if (record)
+            tape.x[node] = momentum[0] * inverse, tape.y[node] = momentum[1] * inverse, tape.inverse[node] = inverse;
     }
 
     INLINE static Real not_a_number() { return Real(__builtin_bit_cast(float, 0x7fffffff)); }

@@ -1,5 +1,5 @@
-// What a replay leaves for the adjoint, in the scratch memory of a team: the particles at the start of each substep, and of
-// each substep the nodes between sums and velocities, which nodes were in use, and where the window was.
+// What a replay leaves for the adjoint, in the scratch memory of a team: the particles at the start of each substep,
+// and of each substep the nodes between sums and velocities, which nodes were in use, and where the window was.
 #pragma once
 #include "substep.cuh"
 
@@ -15,7 +15,9 @@ public:
     }
 
     // Component c of a particle at the start of a substep.
-    INLINE Real& state(int64_t substep, int c, int particle) const { return states[(substep * COMPONENTS + c) * particles + particle]; }
+    INLINE Real& state(int64_t substep, int c, int particle) const {
+        return states[(substep * COMPONENTS + c) * particles + particle];
+    }
 
     INLINE Record record(int64_t substep) const {
         Real* first = raw + (substep < 0 ? 0 : substep) * 3 * nodes;  // the survey is recorded too, and overwritten

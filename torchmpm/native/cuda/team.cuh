@@ -5,9 +5,9 @@
 
 // What all particles, or all nodes, of a substep have in common: the largest number of each kind.
 enum Summary : int {
-    LEFT,      // minus the least first node of a particle's stencil
+    LEFT,  // minus the least first node of a particle's stencil
     BOTTOM,
-    RIGHT,     // the largest
+    RIGHT,  // the largest
     TOP,
     FASTEST,   // rank of the largest speed, see fixed.cuh
     HEAVIEST,  // rank of the largest mass, of a particle before the first substep and then of a node
@@ -19,8 +19,8 @@ enum Failure : int { NONE, LEFT_WINDOW, LEFT_RANGE };
 constexpr int NOWHERE = -(1 << 28);
 
 struct Team {
-    int rank, size;    // of this thread among all
-    int block, blocks; // of the robot
+    int rank, size;       // of this thread among all
+    int block, blocks;    // of the robot
     int (*own)[SUMMARY];  // [3] of this block, in shared memory
     int (*all)[SUMMARY];  // [3] of the team, in global memory
     uint32_t* counter;
@@ -38,10 +38,8 @@ struct Team {
         }
     }
 
-    INLINE void include(int substep, Summary kind, int value) const {
-        const int largest = largest_of_warp(value);
-        if (THREAD % WARP == 0) raise<SUMMARISE>(of(substep) + kind, largest);
-    }
+    // The compiler lets one thread of a warp do it for all, because they have the same address.
+    INLINE void include(int substep, Summary kind, int value) const { raise<SUMMARISE>(of(substep) + kind, value); }
 
     // Wait for all threads of the team.
     template <Barrier barrier> INLINE void wait() const {
