@@ -135,9 +135,11 @@ class ReplayRing(ReplayBuffer):
             super().add(obs, next_obs, action, reward, done, infos)
             return
         timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-        for name, values in zip(FIELDS, (obs, next_obs, action, reward, done, timeouts), strict=True):
-            row: Tensor = getattr(self, name)[self.pos]
-            row.copy_((values if isinstance(values, Tensor) else to_device(values, self.device)).view(row.shape))
+        row: tuple[Any, ...] = obs, next_obs, action, reward, done, timeouts
+        for name, given in zip(FIELDS, row, strict=True):
+            place: Tensor = getattr(self, name)[self.pos]
+            values = given if isinstance(given, Tensor) else to_device(given, self.device)
+            place.copy_(values.view(place.shape))
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
