@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -33,6 +32,8 @@ UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EO
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 #: Transitions in a chunk at most, so that several threads can write what a GPU has collected.
 LARGEST_CHUNK = 2**15
+#: These threads; each copies a chunk from the GPU.
+WRITERS = 8
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise
 
 
@@ -66,7 +67,7 @@ class ReplayArchive:
                 Chunk(f"stage{self.stage}-{first:09d}-{stop:09d}.npz", first, stop)
                 for first, stop in pairwise([start, *stops])
             ]
-            with ThreadPoolExecutor(os.cpu_count()) as pool:  # compression leaves Python's lock to the others
+            with ThreadPoolExecutor(WRITERS) as pool:  # compression leaves Python's lock to the others
                 list(pool.map(partial(self._write, buffer), chunks))
             self.chunks += chunks
         self.chunks = [chunk for chunk in self.chunks if chunk.stop > oldest]
@@ -74,8 +75,7 @@ class ReplayArchive:
 
     def _write(self, buffer: ReplayBuffer, chunk: Chunk) -> None:
         index = np.arange(chunk.start, chunk.stop) % buffer.buffer_size
-        rows = {name: getattr(buffer, name)[index] for name in FIELDS}
-        arrays = {name: value.cpu().numpy() if isinstance(value, Tensor) else value for name, value in rows.items()}
+        arrays = {name: _as_array(getattr(buffer, name)[index]) for name in FIELDS}
         write_atomically(self.folder / chunk.file, lambda file: _write_arrays(file, arrays))
 
     def prune(self) -> None:
@@ -106,6 +106,10 @@ class ReplayArchive:
             raise CheckpointError(f"{self.folder}: rows {stop} to {rows} of the replay buffer are missing")
         buffer.pos = rows % buffer.buffer_size
         buffer.full = rows >= buffer.buffer_size
+
+
+def _as_array(rows: np.ndarray | Tensor) -> np.ndarray:
+    return rows.cpu().numpy() if isinstance(rows, Tensor) else rows
 
 
 def _write_arrays(file: BinaryIO, arrays: dict[str, np.ndarray]) -> None:

@@ -27,7 +27,7 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.checkpoint import ReplayArchive
 from cfp.learner import generator_state, restore_generator
 from cfp.presets import GPU, analytic_preset, for_gpu, sac_preset
-from cfp.sac import replay
+from cfp.sac import learner, replay
 from cfp.tables import read_table
 
 SPEC = ActorSpec((4, 8), (-1.0,), patch=16, encoder="small")
@@ -281,6 +281,19 @@ def test_a_run_on_the_device_goes_on_to_the_last_bit_there_and_from_arrays(tmp_p
     saved[True][0].learn(30, reset_num_timesteps=False)
     whole = saved[True][0].networks()[0].state_dict()
     assert all(torch.equal(value, again[name]) for name, value in whole.items())
+
+
+@pytest.mark.usefixtures("short")
+def test_both_stages_of_a_run_train_on_the_device_and_go_on(tmp_path, monkeypatch):
+    make = learner.make_env
+    monkeypatch.setattr(learner, "make_env", lambda *options: make(*options[:-1], True))
+    assert run(tmp_path / "run", "--steps", "100", "--handover", "0.5") == 0
+    assert resume(tmp_path / "run", "--steps", "120") == 0
+    rows = read_table(tmp_path / "run" / "progress.csv")
+    assert {row["stage"] for row in rows} == {"1", "2"} and rows[-1]["step"] == "120"
+    assert all(np.isfinite(float(row["train/critic_loss"])) for row in rows[3:])
+    state = torch.load(tmp_path / "run" / "checkpoint" / "state.pt", weights_only=True)
+    assert isinstance(state["learner"]["random"]["replay"], torch.Tensor)
 
 
 def test_chunks_are_written_by_several_threads(tmp_path, monkeypatch):
