@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
@@ -235,10 +236,10 @@ class UpdateLoop(BaseAlgorithm):
     def log_row(self) -> None:
         """Record what belongs into a row of the logs beside the scalars of `update`."""
 
-    def after_step(self, done: Tensor, infos: list[dict[str, Any]]) -> bool:
+    def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""
         self.num_timesteps += len(done)
-        self._callback.update_locals({"dones": done.cpu().numpy(), "infos": infos})
+        self._callback.update_locals({"dones": np.asarray(done), "infos": infos})
         return self._callback.on_step()
 
     def record(self, scalars: Scalars) -> None:
@@ -323,6 +324,63 @@ def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
     return 1.0 - (1.0 - final) * progress
 
 
+class AveragedWeights(AveragedModel):
+    """Exponential average of a module's weights, from those after its first update on.
+
+    It counts on the host as well, where torch's own makes a GPU wait in every update.
+
+    Args:
+        module: Is copied.
+        decay: Of the average.
+    """
+
+    def __init__(self, module: nn.Module, decay: float) -> None:
+        super().__init__(module, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        self._average = get_ema_multi_avg_fn(decay)
+        self._has_begun = False
+
+    def update_parameters(self, model: nn.Module) -> None:
+        """Take the weights of ``model`` into the average."""
+        if self._has_begun:
+            self._average(list(self.module.parameters()), list(model.parameters()), 1)
+            self.n_averaged += 1
+        else:
+            super().update_parameters(model)
+            self._has_begun = True
+
+    def load_state_dict(self, *state: Any, **options: Any) -> Any:
+        """Restore a state, see torch."""
+        result = super().load_state_dict(*state, **options)
+        self._has_begun = int(self.n_averaged) > 0
+        return result
+
+
+def generator_state(generator: torch.Generator | np.random.Generator) -> Any:
+    """The state of a generator, for `restore_generator`."""
+    return generator.get_state() if isinstance(generator, torch.Generator) else generator.bit_generator.state
+
+
+def restore_generator(generator: torch.Generator | np.random.Generator, state: Any) -> None:
+    """Set a generator to a state; to that of a generator of another kind only in so far as it is seeded with it.
+
+    So a run that goes on on another kind of device is as random as before, but not the same to the last bit.
+    """
+    if isinstance(generator, np.random.Generator):
+        if isinstance(state, dict):
+            generator.bit_generator.state = state
+        else:
+            generator.bit_generator.state = type(generator.bit_generator)(_digest(state)).state
+    elif isinstance(state, Tensor) and len(state) == len(generator.get_state()):
+        generator.set_state(state)
+    else:
+        generator.manual_seed(_digest(state))
+
+
+def _digest(state: Any) -> int:
+    """A seed that depends on all of a generator's state."""
+    return zlib.crc32(state.numpy().tobytes() if isinstance(state, Tensor) else repr(state).encode())
+
+
 class Resumable:
     """Saves and restores attributes by name: ``parts`` that have a state of their own, and plain ``values``."""
 
@@ -341,7 +399,7 @@ class Resumable:
         for name in self.values:
             value, present = state[name], getattr(self, name)
             if isinstance(present, torch.Generator):
-                present.set_state(value)
+                restore_generator(present, value)
             elif isinstance(present, Tensor) and present.requires_grad:  # an optimiser holds it
                 present.data.copy_(value)
             else:

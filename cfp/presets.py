@@ -122,6 +122,17 @@ SAC: dict[str, dict[str, Any]] = {
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"gamma": 0.99, "gate_penalty": (0.01,)},
 }
+#: Options of the presets ``quick`` and ``long`` that differ on a GPU: as many robots as fill a card, and fewer but
+#: larger updates. No card has run them yet.
+GPU: dict[str, dict[str, Any]] = {
+    "cfp-sac": {"num_envs": 1_024, "gradient_steps": 8, "batch_size": 4_096, "buffer_size": 1_000_000},
+    "cfp-analytic": {"num_envs": 1_024, "minibatch_size": 2_048, "windows_kept": 4},
+}
+#: Options in environment steps of all robots together: on a GPU they grow with the number of robots, so that a training
+#: has as many batched steps as on a CPU.
+COUNTED = ("steps", "random_steps", "update_start", "eval_every", "checkpoint_every", "log_every")
+#: Bytes of a transition, nearly all of them two images, and the part of a GPU's memory that transitions may take.
+TRANSITION, REPLAY_SHARE = 25_000, 1 / 3
 #: Tasks in which ``quick`` makes one update of the networks for each step. With fewer, KICK, OBSTACLE, GROW and DIG
 #: learned less in the same time; SLOT was not tried with fewer.
 MANY_UPDATES = ("kick", "obstacle", "grow", "slot", "dig")
@@ -182,6 +193,26 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
     options |= {name: published[name] for name in ("split", "gate_scale") if name in published}
     options |= dict.fromkeys(("eval_every", "checkpoint_every"), options["steps"] // 12)
     return AnalyticConfig(task=task, **options)
+
+
+def for_gpu(config: Config, memory: int | None = None) -> Config:
+    """The default options on a GPU, see `GPU`.
+
+    Args:
+        config: Those on a CPU.
+        memory: Of the GPU, in bytes; None: not known.
+    """
+    changes = dict(GPU.get(config.algo, {}))
+    if not changes or config.preset == "paper":
+        return config
+    ratio = changes["num_envs"] // config.num_envs
+    for name in COUNTED:
+        value = getattr(config, name, None)
+        if value is not None:
+            changes[name] = tuple(part * ratio for part in value) if isinstance(value, tuple) else value * ratio
+    if "buffer_size" in changes and memory is not None:
+        changes["buffer_size"] = min(changes["buffer_size"], int(REPLAY_SHARE * memory) // TRANSITION)
+    return replace(config, **changes)
 
 
 def _published(task: str) -> dict[str, Any]:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from cfp.config import RunConfig, update_from_dict
+from cfp.envs.make import gpu_memory
 from cfp.errors import ConfigError
 from cfp.learner import Learner
 from cfp.policy import KIND, Policy, policy_file, read_policy
-from cfp.presets import DEFAULT_TASK, default_algo, like_start
+from cfp.presets import DEFAULT_TASK, default_algo, for_gpu, like_start
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.learner.Learner`.
 ALGORITHMS: dict[str, str] = {
@@ -35,7 +36,7 @@ def find(name: str) -> type[Learner]:
 
 
 def configure(values: dict[str, Any]) -> RunConfig:
-    """Options from JSON values; those that are left out come from the preset that the values name.
+    """Options from JSON values; those that are left out come from the preset and the device that the values name.
 
     Raises:
         ConfigError: There is no such algorithm, task, preset or option, or a value is of another type.
@@ -45,7 +46,9 @@ def configure(values: dict[str, Any]) -> RunConfig:
     learner = find(str(algo))
     if preset not in learner.presets:
         raise ConfigError(f"preset must be {' or '.join(learner.presets)} for {algo}, got {preset!r}")
-    return update_from_dict(like_start(learner.preset(task, preset), values), values)
+    defaults = like_start(learner.preset(task, preset), values)
+    memory = gpu_memory(str(values.get("device", defaults.device)))
+    return update_from_dict(defaults if memory == 0 else for_gpu(defaults, memory), values)
 
 
 def load(path: str | Path, device: str = "cpu") -> Policy:

@@ -34,15 +34,16 @@ EXAMPLES = (
     "--resume --out runs/M",
 )
 #: Options that choose the defaults of all others, and the folder.
-DECISIVE = ("algo", "task", "preset", "seed", "start_from", "refine")
+DECISIVE = ("algo", "task", "preset", "seed", "device", "start_from", "refine")
 
 
 @dataclass(frozen=True)
 class Command:
     """Train a policy on a DittoGym task, one stage after the other.
 
-    Default values come from the preset of algorithm and task, then from the --config file, then from the command line.
-    This help shows those of one algorithm and task; --algo ALGO --task TASK --help shows those of others.
+    Default values come from the preset of algorithm, task and device, then from the --config file, then from the
+    command line. This help shows those of one algorithm and task; --algo ALGO --task TASK --help shows those of others,
+    and --device cuda --help those on a GPU.
 
     Ctrl-C writes a checkpoint and stops the run; --resume continues it.
     """
@@ -63,7 +64,7 @@ class Command:
 def parse(words: Sequence[str], module: str = "cfp.train", started: str | None = None) -> Command:
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("algo", "task", "preset", "seed", "start-from", "learner", "out", "config"):
+    for name in ("algo", "task", "preset", "seed", "device", "start-from", "learner", "out", "config"):
         scan.add_argument(f"--{name}", f"--{name.replace('-', '_')}", nargs="?")  # what lacks a value is refused below
     for name in ("refine", "resume"):
         scan.add_argument(f"--{name}", action="store_true")
@@ -144,7 +145,7 @@ def train(command: Command, hint: str) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"out must be a folder, got the file {folder}")
     if command.dry_run:
-        check_options(config)
+        check_options(replace(config, device="cpu"))  # the options of a GPU can be printed where there is none
         print(json.dumps(dataclasses.asdict(config), indent=2))
         return
     if command.resume and not holds_run(folder):

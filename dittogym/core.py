@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dittogym.action import patch_field, place
+from dittogym.copies import constant
 from dittogym.geometry import GRID, centre_in_window, contains
 from dittogym.observation import Camera
 from dittogym.physics import NAMES, Physics, bodies_of
@@ -221,7 +222,38 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
     if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
         allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {model.spec.patch}"
         raise ValueError(f"action must be {allowed}, got {_kind(action)}")
-    return evaluate(model, *advance(model, state, action), soft=soft)
+    return judge(model, simulate(model, state, action), soft=soft)
+
+
+class Moment(NamedTuple):
+    """What a control step comes to before it is rewarded: all that does not depend on a task's own functions.
+
+    Attributes:
+        state: After the step, with the task state from before it.
+        actuation: (B, 2, P, P) on the patch, Pa.
+        observation: (B, 3, 64, 64) uint8.
+        now: Averages after the step.
+        info: See :func:`info_of`.
+        cost: (B,) :func:`dittogym.rewards.action_cost`; ``None`` where it has no weight.
+    """
+
+    state: EnvState
+    actuation: Tensor
+    observation: Tensor
+    now: Features
+    info: dict[str, Tensor]
+    cost: Tensor | None
+
+
+def simulate(model: Model, state: EnvState, action: Tensor) -> Moment:
+    """Advance the physics by one control step and look at the result; arguments as in :func:`advance`."""
+    return _look(model, *advance(model, state, action))
+
+
+def _look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
+    now = features_of(state.particles, model.num_robot_particles)
+    cost = action_cost(actuation) if model.spec.weights.get("action") else None
+    return Moment(state, actuation, observe(model, state), now, info_of(model, state, now), cost)
 
 
 def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
@@ -279,9 +311,7 @@ def soft_observation(model: Model, state: EnvState) -> Tensor:
 
 
 def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = False) -> StepResult:
-    """Observation, reward, termination and success of a state that :func:`advance` led to.
-
-    Elements whose state is not valid, see :func:`is_valid`, end with the term ``failure`` = :data:`FAILURE_REWARD`.
+    """Observation, reward, termination and success of a state that :func:`advance` led to; see :func:`judge`.
 
     Args:
         model: The task.
@@ -289,25 +319,36 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
         actuation: (B, 2, P, P) on the patch, Pa.
         soft: As in :func:`step`.
     """
-    spec, observation = model.spec, observe(model, state)
-    now = features_of(state.particles, model.num_robot_particles)
-    info = info_of(model, state, now)
+    return judge(model, _look(model, state, actuation), soft=soft)
+
+
+def judge(model: Model, moment: Moment, *, soft: bool = False) -> StepResult:
+    """Reward, termination and success.
+
+    Elements whose state is not valid, see :func:`is_valid`, end with the term ``failure`` = :data:`FAILURE_REWARD`.
+
+    Args:
+        model: The task.
+        moment: After the step.
+        soft: As in :func:`step`.
+    """
+    spec, (state, actuation, observation, now, info, cost) = model.spec, moment
     valid = info["finite"]
     transition = _transition(model, state, now, observation, EXACT)
     reward = spec.reward_fn(transition, spec)
-    terms, total = _weighted(spec, reward, transition, actuation, valid)
+    terms, total = _weighted(spec, reward, transition, cost, valid)
     image, true_total = None, total
     if soft:
         image = soft_observation(model, state)
         transition = transition._replace(observation=image, ops=SMOOTH)
-        terms, total = _weighted(spec, spec.reward_fn(transition, spec), transition, actuation, valid)
+        terms, total = _weighted(spec, spec.reward_fn(transition, spec), transition, cost, valid)
     terminated = ~valid if reward.terminated is None else reward.terminated | ~valid
     if spec.split_limit is not None:
         terminated = terminated | (now.radius_of_gyration > spec.split_limit)
     if reward.task_state is not None:  # a copy: it may hold what info does
         state = replace(state, task_state=tree.map(Tensor.clone, dict(reward.task_state)))
     success = None if reward.success is None else reward.success & valid
-    info |= reward.info or {}
+    info = info | dict(reward.info or {})
     return StepResult(state, observation, total, terms, terminated, success, info, true_total, actuation, image)
 
 
@@ -329,16 +370,16 @@ def _transition(model: Model, state: EnvState, now: Features, observation: Tenso
 
 
 def _weighted(
-    spec: TaskSpec, reward: Reward, transition: Transition, actuation: Tensor, valid: Tensor
+    spec: TaskSpec, reward: Reward, transition: Transition, cost: Tensor | None, valid: Tensor
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     terms, weights, radius = dict(reward.terms), spec.weights, transition.now.radius_of_gyration
     if spec.split_limit is not None:
         terms["split"] = transition.ops.split_penalty(radius, spec.split_limit)
-    if weights.get("action"):
-        terms["action"] = -action_cost(actuation)
-    terms["alive"] = torch.ones_like(radius)
-    terms["failure"] = torch.zeros_like(radius)
+    if cost is not None:
+        terms["action"] = -cost
+    terms["alive"] = constant(1.0, radius).expand_as(radius)
+    terms["failure"] = constant(0.0, radius).expand_as(radius)
     factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), radius.dtype, radius.device)
     values = torch.stack(tuple(terms.values())).to(factors) * factors
     counted = torch.where(valid, values, failed).unbind()

@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from dittogym.bodies.json_values import to_values
 from dittogym.bodies.positions import MAX_SEED
+from dittogym.copies import to_device, to_host
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Act, Recording, as_function, film
 from dittogym.render.scene import check_size, describe
@@ -48,7 +49,7 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     # A copy: torch takes neither negative strides nor foreign byte orders.
     numbers = np.float64 if env.dtype is torch.float64 else np.float32
     array = np.array(array[None] if single else array, numbers, order="C")
-    return torch.from_numpy(array).to(env.device)
+    return to_device(array, env.device)
 
 
 def flat(info: dict[str, Any]) -> dict[str, torch.Tensor]:
@@ -59,9 +60,7 @@ def flat(info: dict[str, Any]) -> dict[str, torch.Tensor]:
 
 def as_numpy(value: torch.Tensor | dict[str, Any]) -> Any:
     """Copies of a tensor, or of all in an ``info``, as arrays, which the user may write to."""
-    if isinstance(value, dict):
-        return {name: as_numpy(entry) for name, entry in flat(value).items()}
-    return value.detach().cpu().numpy().copy()
+    return to_host(flat(value)) if isinstance(value, dict) else to_host({"": value})[""]
 
 
 def first(value: Any) -> Any:
@@ -181,11 +180,14 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
-            observation, reward, terminated, truncated, info = self.torch_env.step(batch)
-        self._return += float(reward[0])
+            image, *own, raw = self.torch_env.step(batch)
+        names = ("_reward", "_terminated", "_truncated")
+        info = first(to_host(flat(raw) | dict(zip(names, own, strict=True))))  # a GPU is waited for once
+        reward, terminated, truncated = float(info.pop(names[0])), bool(info.pop(names[1])), bool(info.pop(names[2]))
+        self._return += reward
         self._show()
-        limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
-        return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
+        limit = truncated and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
+        return first(as_numpy(image)), reward, terminated, limit, info
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`; returns its observation (3, 64, 64) uint8.

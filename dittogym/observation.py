@@ -1,7 +1,7 @@
 """The observation (3, 64, 64): occupancy and velocity in the half metre around the robot, row 0 at the top.
 
-Drawn from particles, obstacles and goal in torch operations, or in one C++ function with the same bytes (of splats at
-most one off). Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
+Drawn from particles, obstacles and goal in torch operations, or in one C++ function or CUDA kernel, whose bytes are the
+same or one off. Crop and background also exist as smooth functions, see ``docs/concepts/gradients.md``.
 """
 
 from __future__ import annotations
@@ -12,14 +12,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
+from dittogym import cuda_picture
 from dittogym.geometry import GRID, Box, Centre, Window, centre_in_window
 from torchmpm.backends import warn_eager
+from torchmpm.native.cuda.compiler import unavailable
+from torchmpm.native.cuda.driver import Driver
+from torchmpm.native.cuda.launcher import CUDA
 from torchmpm.native.library import POOL, build, thread_pool
+from torchmpm.sampling import sobol
 from torchmpm.transfer import quadratic_weights
 from torchmpm.tree import cached_tensors, transforming
 
@@ -62,17 +67,16 @@ class Camera:
     particle_weight: tuple[float, ...]  # By body, the full-size particles that one particle stands for
     hidden_velocity: tuple[bool, ...]  # By body, whether the velocity channels leave it out
     pixels: bool  # Whether each particle sets a pixel, as with full particle counts, instead of splats
-    native: bool  # Whether to draw in C++ where that is possible
+    native: bool  # Whether to draw in C++ or CUDA where that is possible
 
     def observe(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
         arrays = (x.detach(), v.detach(), origin.detach(), centre.detach())
-        if not self.native or x.device.type != "cpu" or transforming():  # torch.func cannot look into the C++ function
+        if not self.native or x.device.type not in ("cpu", "cuda") or transforming():  # which cannot look into them
             return self.draw(*arrays)
-        try:
-            draw = native_drawing(self, x.dtype)
-        except ValueError as error:  # no compiler, or it failed
-            warn_eager("the observation", str(error))
+        draw = _drawing(self, x.dtype, x.device)
+        if isinstance(draw, str):
+            warn_eager("the observation", draw)
             return self.draw(*arrays)
         return draw(*arrays)
 
@@ -303,17 +307,17 @@ def splat_means(shown: RasterInput) -> Tensor:
 
 def _splat_weights(shown: RasterInput) -> tuple[Tensor, Tensor]:
     """Weights (B, 9, N) of the pixels around each particle, and their indices (B, 9 N) in the framed image."""
-    position, width = shown.position, SIZE + 2 * FRAME
-    u = position[..., 0] * (RASTER / BLOCK) - shown.column / BLOCK - 0.5
-    w = (1.0 - position[..., 1]) * (RASTER / BLOCK) - shown.row / BLOCK - 0.5
+    x, y = shown.position.unbind(-1)
+    corner, width = torch.stack((shown.column, shown.row)), SIZE + 2 * FRAME
+    at = torch.stack((x, 1.0 - y)) * (RASTER / BLOCK) - corner / BLOCK - 0.5  # (2, B, N) pixels rightwards, downwards
     middle, reach = 0.5 * SIZE, 0.5 * SIZE + 1.5
-    near = shown.visible & ((u - middle).abs() < reach) & ((w - middle).abs() < reach)
-    u, w = torch.where(near, u, 0.0), torch.where(near, w, 0.0)
-    base_u, base_w = torch.floor(u - 0.5), torch.floor(w - 0.5)
-    across = quadratic_weights(u - base_u) * (near * shown.weight)[:, None]
-    weight = (quadratic_weights(w - base_w)[:, :, None] * across[:, None]).flatten(1, 2)
-    first = ((base_w + FRAME) * width + base_u + FRAME).to(torch.int64)
-    offset = torch.arange(3, device=u.device)
+    near = shown.visible & ((at - middle).abs() < reach).all(0)
+    at = torch.where(near, at, 0.0)
+    base = torch.floor(at - 0.5)
+    across, along = quadratic_weights(at - base)
+    weight = (along[:, :, None] * (across * (near * shown.weight)[:, None])[:, None]).flatten(1, 2)
+    first = ((base[1] + FRAME) * width + base[0] + FRAME).to(torch.int64)
+    offset = torch.arange(3, device=at.device)
     ids = (first[:, None] + (offset[:, None] * width + offset).view(9, 1)).flatten(1)
     return weight, ids
 
@@ -335,18 +339,32 @@ class Picture(ctypes.Structure):
     ]
 
 
+#: Draws x, v, origin and centre of :class:`Camera`.
+Drawing: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
 @functools.lru_cache(maxsize=64)
-def native_drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """A function that draws what a camera sees as one C++ call, for tensors on the CPU."""
-    kind = {torch.float32: "float", torch.float64: "double"}[dtype]
-    function = getattr(build(_SOURCE, "-ffp-contract=off"), f"dittogym_draw_{kind}")
+def _drawing(camera: Camera, dtype: torch.dtype, device: torch.device) -> Drawing | str:
+    """What draws on a device, or why nothing but :meth:`Camera.draw` does."""
+    try:
+        return native_drawing(camera, dtype) if device.type == "cpu" else cuda_drawing(camera, dtype, device)
+    except (ValueError, RuntimeError) as error:  # no compiler, or it failed
+        return str(error)
+
+
+def tables(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Of each body, particles, full-size particles that one stands for, and whether its velocity is hidden; boxes."""
     bodies = list(zip(camera.counts, camera.particle_weight, camera.hidden_velocity, strict=True))
-    body = torch.tensor(bodies, dtype=torch.float64, device="cpu")
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
-    box = torch.tensor(edges, dtype=torch.float64, device="cpu")
-    constants = {
+    body, box = (torch.tensor(rows, dtype=torch.float64, device=device) for rows in (bodies, edges))
+    return body, box
+
+
+def numbers(camera: Camera) -> dict[str, Any]:
+    """What the C++ function and the CUDA kernel read besides :func:`tables`."""
+    return {
         "pixels": camera.pixels,
-        "bodies": len(bodies),
+        "bodies": len(camera.counts),
         "boxes": len(camera.boxes),
         "view": tuple(math.nan if c is None else c for c in camera.view),
         "margin": GRID.margin,
@@ -354,6 +372,13 @@ def native_drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tens
         "clip": CLIP,
         "saturation": SATURATION,
     }
+
+
+def native_drawing(camera: Camera, dtype: torch.dtype) -> Drawing:
+    """A function that draws what a camera sees as one C++ call, for tensors on the CPU."""
+    kind = {torch.float32: "float", torch.float64: "double"}[dtype]
+    function = getattr(build(_SOURCE, "-ffp-contract=off"), f"dittogym_draw_{kind}")
+    (body, box), constants = tables(camera, torch.device("cpu")), numbers(camera)
 
     def draw(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         x, v = (t.movedim(-1, 0).contiguous() for t in (x, v))
@@ -367,4 +392,33 @@ def native_drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tens
             raise MemoryError("there is not enough memory to draw the observation")
         return image
 
+    return draw
+
+
+def cuda_drawing(camera: Camera, dtype: torch.dtype, device: torch.device, driver: Driver = CUDA.driver) -> Drawing:
+    """A function that draws what a camera sees as one CUDA kernel, which has been tried against :meth:`Camera.draw`.
+
+    Raises:
+        ValueError: The kernel cannot be compiled for the device, or draws something else.
+    """
+    if device.type == "cuda" and (reason := unavailable(device)) is not None:
+        raise ValueError(reason)
+    (body, box), constants = tables(camera, device), numbers(camera)
+    full = sum(n * weight for n, weight in zip(camera.counts, camera.particle_weight, strict=True))
+    kernel = cuda_picture.Kernel.of(dtype)
+
+    def draw(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
+        x, v = (t.movedim(-1, 0).contiguous() for t in (x, v))
+        image = torch.empty(x.shape[1], *SHAPE, dtype=torch.uint8, device=x.device)
+        arrays = {"body": body, "box": box, "x": x, "v": v, "image": image}
+        arrays |= {"origin": origin.contiguous(), "centre": centre.contiguous()}
+        cuda_picture.draw(driver, kernel, arrays, full, **constants)
+        return image
+
+    places = torch.from_numpy(sobol(2 * sum(camera.counts), seed=0)).view(2, -1, 2).to(device, dtype)
+    origin = places.new_zeros(2, 2)
+    arrays = (places, 10.0 - 20.0 * places, origin, origin + 0.5)
+    difference = int((draw(*arrays).int() - camera.draw(*arrays).int()).abs().max())
+    if difference > 1:
+        raise ValueError(f"its CUDA kernel was tried on {device}, and a pixel differed by {difference} levels")
     return draw

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dittogym.copies import constant
 from dittogym.spec import TaskSpec
 from torchmpm import Body, Elastic, VonMises, checks, tree
 
@@ -32,8 +33,14 @@ PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
 def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
     """The task's own values for B simulations, B the length of ``like``."""
-    own = {name: getattr(spec, name, 1.0) for name in NAMES}  # a factor of 1 on the mass
-    return {name: _expanded(like.new_tensor(value), name, len(like)) for name, value in own.items()}
+    return {name: default(spec, name, like) for name in NAMES}
+
+
+def default(spec: TaskSpec, name: str, like: Tensor) -> Tensor:
+    """The task's own value of one of :data:`NAMES`, as :func:`defaults` gives it."""
+    value = getattr(spec, name, 1.0)  # a factor of 1 on the mass
+    own = value.to(like) if isinstance(value, Tensor) else constant(value, like)
+    return _expanded(own, name, len(like))
 
 
 def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor]:
@@ -110,12 +117,12 @@ def real_tensor(name: str, given: Any) -> Tensor:
 
 def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tensor) -> dict[str, Tensor]:
     """``new`` where ``mask`` (B,) holds, ``old`` elsewhere; the task's own value where one of them has none."""
-    if bool(mask.all()):
-        return dict(new)
-    own = defaults(spec, like)
-    names = [name for name in NAMES if name in old or name in new]
-    pairs = {name: (new.get(name, own[name]), old.get(name, own[name])) for name in names}
-    return {name: tree.where(mask, *_broadcast_pair(*pair)) for name, pair in pairs.items()}
+    result = {}
+    for name in NAMES:
+        if name in old or name in new:
+            one, other = (values[name] if name in values else default(spec, name, like) for values in (new, old))
+            result[name] = tree.where(mask, *_broadcast_pair(one, other))
+    return result
 
 
 def bodies_of(

@@ -7,11 +7,11 @@
 #include <limits>
 #include <vector>
 
+#include "picture.hpp"
 #include "team.hpp"
 
-// As in dittogym/observation.py.
-constexpr int SIZE = 64, BLOCK = 8, RASTER = 1024, FRAME = 3;
-constexpr int FINE = SIZE * BLOCK, WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
+using raster::BLOCK_SIZE, raster::FINE, raster::FRAME, raster::SIZE;
+constexpr int WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
 
 // As `class Picture` in observation.py. Tensors are contiguous, of Real; where nothing else is said leading batch.
 struct Picture {
@@ -35,8 +35,7 @@ namespace {
 template <class Real> struct Drawing {
     const Picture& picture;
     int64_t element = 0;
-    Real left = 0, bottom = 0;  // the window's corner
-    int row = 0, column = 0;    // the crop's corner in fine pixels
+    raster::Crop<Real> crop{};
     uint8_t resting;            // code of no velocity
     std::vector<Real> px, py, vx, vy;
     std::vector<uint8_t> visible, wins;
@@ -49,61 +48,39 @@ template <class Real> struct Drawing {
         : picture(given), px(given.particles), py(given.particles), vx(given.particles), vy(given.particles),
           visible(given.particles), covered(given.boxes ? FINE * WORDS : 0), fraction(given.boxes ? SIZE * SIZE : 0),
           sums(given.pixels ? SIZE * SIZE : WIDE * WIDE) {
-        resting = velocity_code(0);
+        resting = raster::Codes<Real>::velocity(0, Real(picture.clip));
         if (!given.pixels) return;
         wins.resize(given.particles), pixel.resize(given.particles), taken.resize(FINE * WORDS);
     }
 
     void run(int64_t which) {
         element = which;
-        place();
+        crop = raster::Crop<Real>::around(picture.view, start(picture.origin, 2), start(picture.centre, 2));
         read_particles();
         draw_boxes();
         std::fill(sums.begin(), sums.end(), std::array<Real, 4>{});
         picture.pixels ? draw_pixels() : splat();
     }
 
-    static int corner(Real centre) {
-        const Real fine = std::trunc(Real(RASTER) * centre);
-        const int half = FINE / 2;
-        if (!(fine > half)) return 0;  // also where the centre is not a number
-        return fine > RASTER - half ? RASTER - FINE : int(fine) - half;
-    }
-
-    void place() {
-        const Real* origin = static_cast<const Real*>(picture.origin) + 2 * element;
-        const Real* centre = static_cast<const Real*>(picture.centre) + 2 * element;
-        left = origin[0], bottom = origin[1];
-        const auto view = [&](int axis) {
-            return std::isnan(picture.view[axis]) ? centre[axis] - origin[axis] : Real(picture.view[axis]);
-        };
-        column = corner(view(0)), row = RASTER - corner(view(1)) - FINE;
-    }
+    // Where the numbers of the element begin in an array (batch, width).
+    const Real* start(const void* array, int64_t width) const { return static_cast<const Real*>(array) + width * element; }
 
     void read_particles() {
         const int64_t count = picture.particles, plane = picture.batch * count;
-        const Real* x = static_cast<const Real*>(picture.x) + element * count;
-        const Real* v = static_cast<const Real*>(picture.v) + element * count;
+        const Real *x = start(picture.x, count), *v = start(picture.v, count);
         const Real margin = Real(picture.margin), extent = Real(picture.extent), clip = Real(picture.clip);
         int64_t first = 0;
         for (int64_t b = 0; b < picture.bodies; ++b) {
             const int64_t end = first + int64_t(picture.body[3 * b]);
             const Real moving = picture.body[3 * b + 2] != 0 ? Real(0) : Real(1);
             for (int64_t k = first; k < end; ++k) {
-                px[k] = x[k] - left, py[k] = x[k + plane] - bottom;
-                vx[k] = moving * std::min(std::max(Real(2) * v[k], -clip), clip);
-                vy[k] = moving * std::min(std::max(Real(2) * v[k + plane], -clip), clip);
-                // The difference of a number to itself is zero, that of anything else is not a number.
-                const Real all = (x[k] + v[k]) + (x[k + plane] + v[k + plane]);
-                visible[k] = (all - all == 0) & (px[k] > margin) & (px[k] < extent);
+                px[k] = x[k] - crop.left, py[k] = x[k + plane] - crop.bottom;
+                vx[k] = moving * raster::clamped(Real(2) * v[k], -clip, clip);
+                vy[k] = moving * raster::clamped(Real(2) * v[k + plane], -clip, clip);
+                visible[k] = raster::is_visible(x[k], x[k + plane], v[k], v[k + plane], px[k], margin, extent);
             }
             first = end;
         }
-    }
-
-    static bool between(Real value, const double* ends, bool closed) {
-        const Real low = Real(ends[0]), high = Real(ends[1]);
-        return closed ? value >= low && value <= high : value > low && value < high;
     }
 
     void draw_boxes() {
@@ -113,28 +90,26 @@ template <class Real> struct Drawing {
             const double* box = picture.box + 5 * b;
             std::array<uint64_t, WORDS> across{};
             for (int c = 0; c < FINE; ++c)
-                if (between(Real(float(column + c) / RASTER) + left, box, box[4] != 0))
+                if (crop.column_in(box, c))
                     across[c / 64] |= uint64_t(1) << (c % 64);
             for (int r = 0; r < FINE; ++r)
-                if (between(Real(float(RASTER - row - r) / RASTER) + bottom, box + 2, box[4] != 0))
+                if (crop.row_in(box, r))
                     for (int w = 0; w < WORDS; ++w) covered[r * WORDS + w] |= across[w];
         }
         std::fill(fraction.begin(), fraction.end(), Real(0));
         for (int r = 0; r < FINE; ++r)
             for (int w = 0; w < WORDS; ++w) {
                 const uint64_t word = covered[r * WORDS + w];
-                for (int c = 0; word && c < 64 / BLOCK; ++c)  // most words are empty
-                    fraction[r / BLOCK * SIZE + w * (64 / BLOCK) + c] +=
-                        Real(__builtin_popcount(word >> (c * BLOCK) & ((1u << BLOCK) - 1))) / (BLOCK * BLOCK);
+                for (int c = 0; word && c < 64 / BLOCK_SIZE; ++c)  // most words are empty
+                    fraction[r / BLOCK_SIZE * SIZE + w * (64 / BLOCK_SIZE) + c] +=
+                        Real(__builtin_popcount(word >> (c * BLOCK_SIZE) & ((1u << BLOCK_SIZE) - 1))) / (BLOCK_SIZE * BLOCK_SIZE);
             }
     }
 
     void find_pixels() {
-        const Real first_row = Real(row), first_column = Real(column);
         for (int64_t k = 0; k < picture.particles; ++k) {
-            const Real r = std::trunc((Real(1) - py[k]) * Real(RASTER)) - first_row;
-            const Real c = std::trunc(px[k] * Real(RASTER)) - first_column;
-            const bool inside = visible[k] & (py[k] > 0) & (r >= 0) & (r < FINE) & (c >= 0) & (c < FINE);
+            const Real r = crop.fine_row(py[k]), c = crop.fine_column(px[k]);
+            const bool inside = visible[k] & crop.inside(py[k], r, c);
             pixel[k] = inside ? int(inside ? r : 0) * FINE + int(inside ? c : 0) : -1;
         }
     }
@@ -164,68 +139,49 @@ template <class Real> struct Drawing {
         for (int64_t k = 0; k < picture.particles; ++k) {
             if (!wins[k]) continue;
             const int r = pixel[k] / FINE, c = pixel[k] % FINE;
-            std::array<Real, 4>& sum = sums[(r / BLOCK) * SIZE + c / BLOCK];
+            std::array<Real, 4>& sum = sums[(r / BLOCK_SIZE) * SIZE + c / BLOCK_SIZE];
             if (!picture.boxes || !(covered[pixel[k] / 64] >> (pixel[k] % 64) & 1)) sum[0] += 1;
             sum[1] += vx[k], sum[2] += vy[k];
         }
-        constexpr Real area = BLOCK * BLOCK;
         for (int cell = 0; cell < SIZE * SIZE; ++cell) {
             const auto& [occupied, across, up, _] = sums[cell];
-            quantise(cell, occupied / area + (picture.boxes ? fraction[cell] : Real(0)), across / area, up / area);
+            const Real covers = picture.boxes ? fraction[cell] : Real(0);
+            put(cell, raster::pixel_codes(occupied, across, up, covers, Real(picture.clip), resting));
         }
     }
 
     void splat() {
-        constexpr Real middle = Real(0.5) * SIZE, reach = middle + Real(1.5);
         int64_t k = 0;
         for (int64_t b = 0; b < picture.bodies; ++b) {
             const Real stands_for = Real(picture.body[3 * b + 1]);
             const Real moving = picture.body[3 * b + 2] != 0 ? Real(0) : Real(1);
             for (const int64_t end = k + int64_t(picture.body[3 * b]); k < end; ++k) {
-                const Real u = px[k] * Real(RASTER / BLOCK) - Real(float(column) / BLOCK) - Real(0.5);
-                const Real w = (Real(1) - py[k]) * Real(RASTER / BLOCK) - Real(float(row) / BLOCK) - Real(0.5);
-                if (!visible[k] || !(std::abs(u - middle) < reach && std::abs(w - middle) < reach)) continue;
+                const Real u = crop.pixel_column(px[k]), w = crop.pixel_row(py[k]);
+                if (!visible[k] || !crop.near(u, w)) continue;
                 const Real base_u = std::floor(u - Real(0.5)), base_w = std::floor(w - Real(0.5));
-                const std::array<Real, 3> across = weights(u - base_u), along = weights(w - base_w);
+                const raster::Weights<Real> across(u - base_u), along(w - base_w);
                 const std::array<Real, 4> each{1, moving * vx[k], moving * vy[k], moving};
                 std::array<Real, 4>* node = sums.data() + (int(base_w) + FRAME) * WIDE + int(base_u) + FRAME;
                 for (int i = 0; i < 3; ++i, node += WIDE)
                     for (int j = 0; j < 3; ++j) {
-                        const Real weight = along[i] * (across[j] * stands_for);
+                        const Real weight = along.of[i] * (across.of[j] * stands_for);
                         for (int n = 0; n < 4; ++n) node[j][n] += weight * each[n];
                     }
             }
         }
-        const Real saturation = Real(picture.saturation);
+        const Real saturation = Real(picture.saturation), clip = Real(picture.clip);
         for (int r = 0; r < SIZE; ++r)
             for (int c = 0; c < SIZE; ++c) {
                 const auto& [expected, across, up, expected_moving] = sums[(r + FRAME) * WIDE + c + FRAME];
                 const Real free = picture.boxes ? Real(1) - fraction[r * SIZE + c] : Real(1);
-                // Most pixels are empty: that spares their exponentials.
-                const Real miss = expected > 0 ? std::exp(-expected / saturation) : Real(1);
-                const Real hit = expected_moving > 0 ? (Real(1) - std::exp(-expected_moving / saturation)) / expected_moving : Real(0);
-                quantise(r * SIZE + c, Real(1) - free * miss, across * hit, up * hit);
+                put(r * SIZE + c, raster::splat_codes(expected, across, up, expected_moving, free, saturation, clip, resting));
             }
     }
 
-    // Weights of the three pixels around a point (`quadratic_weights` in torchmpm/spline.py).
-    static std::array<Real, 3> weights(Real f) {
-        const Real a = Real(1.5) - f, b = f - Real(1), c = f - Real(0.5);
-        return {Real(0.5) * (a * a), Real(0.75) - b * b, Real(0.5) * (c * c)};
-    }
-
-    void quantise(int cell, Real occupancy, Real across, Real up) {
+    void put(int cell, raster::Codes<Real> codes) {
         uint8_t* image = picture.image + element * 3 * SIZE * SIZE + cell;
-        image[0] = code(Real(255) * occupancy);
-        const bool rests = across == 0 && up == 0;  // as in most pixels
-        image[SIZE * SIZE] = rests ? resting : velocity_code(across);
-        image[2 * SIZE * SIZE] = rests ? resting : velocity_code(up);
+        image[0] = codes.occupancy, image[SIZE * SIZE] = codes.across, image[2 * SIZE * SIZE] = codes.up;
     }
-    uint8_t velocity_code(Real mean) const {
-        const Real clip = Real(picture.clip);
-        return code(Real(10) * (Real(255) * (mean + clip) / (2 * clip) - Real(127)) + Real(127));
-    }
-    static uint8_t code(Real value) { return uint8_t(std::min(std::max(value, Real(0)), Real(255))); }
 };
 
 template <class Real> int draw(const Picture* picture) {

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from dittogym.copies import constant
 from dittogym.observation import silhouette, soft_silhouette
 from torchmpm import ParticleState
 from torchmpm.materials.linalg import safe_sqrt
@@ -221,7 +222,7 @@ def distance(x: Tensor, point: Tensor | Sequence[float]) -> Tensor:
     Raises:
         ValueError: The point has another number of coordinates.
     """
-    point = point if isinstance(point, Tensor) else x.new_tensor(point)
+    point = point if isinstance(point, Tensor) else constant(point, x)
     if point.ndim == 0 or point.shape[-1] != 2:
         raise ValueError(f"point must be two numbers or of shape (B, 2), got shape {tuple(point.shape)}")
     return safe_sqrt(_squared_distance(x, point))

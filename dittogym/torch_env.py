@@ -17,7 +17,9 @@ from torch import Tensor
 from dittogym import core
 from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
+from dittogym.copies import to_device
 from dittogym.core import EnvState, make_model
+from dittogym.cuda_graph import Replayed
 from dittogym.observation import SHAPE
 from dittogym.physics import Physics, check_effect, merged, physics_values
 from dittogym.render.frame import frame, png
@@ -125,6 +127,11 @@ class TorchEnv:
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
         self._actuation: Tensor | None = None
+        # On a GPU, 0 as long as all actions since the last reset were finite, else NaN.
+        self._unread = None if self.device.type == "cpu" else torch.zeros((), dtype=self.dtype, device=self.device)
+        # What a user wrote, such as materials and reward functions, is called in every step.
+        own = self.device.type == "cuda" and self.model.solver.kernels.unsupported(self.device) is None
+        self._replayed = Replayed(core.simulate) if own and backend != "eager" else None
 
     def __repr__(self) -> str:
         return f"TorchEnv({self.spec.name!r}, {self.num_envs}, {self.action_resolution}, device={str(self.device)!r})"
@@ -212,24 +219,24 @@ class TorchEnv:
                 type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
-        chosen = find_mask("mask", mask, self.num_envs, self.device)
+        chosen = find_mask("mask", mask, self.num_envs)
         check_snapshot(snapshot, self._constants, self.num_envs)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
-        if not bool(chosen.all()):
-            mine = self.env_state
-            physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
+        actuation = None
+        if not chosen.all():
+            mine, where = self.env_state, to_device(chosen, self.device)
+            physics = merged(self.spec, mine.physics, state.physics, where, self._like)
             state, mine = (replace(each, physics=physics) for each in (state, mine))
-            state, observation = tree.where(chosen, (state, observation), (mine, self.observation()))
-        actuation = self._actuation_of_others(chosen)
+            state, observation = tree.where(where, (state, observation), (mine, self.observation()))
+            actuation = self._actuation_without(where)
         self.env_state = state
         self._actuation, self._observation = actuation, observation.clone()
         return observation
 
-    def _actuation_of_others(self, mask: Tensor) -> Tensor | None:
+    def _actuation_without(self, mask: Tensor) -> Tensor | None:
         """The actuation of the last step, which pictures show, zero where the mask (B,) holds."""
-        kept = None if bool(mask.all()) else self._actuation
-        return None if kept is None else kept.masked_fill(mask[:, None, None, None], 0.0)
+        return None if self._actuation is None else self._actuation.masked_fill(mask[:, None, None, None], 0.0)
 
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes. A reset that raises an error changes nothing.
@@ -240,45 +247,58 @@ class TorchEnv:
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; ``"physics"``: constants of the matter, see
                 :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
-                ``"reset_mask"``: (B,) bool, reset only these elements. Later resets reuse values without gradients.
+                ``"reset_mask"``: (B,) bool, reset only these elements; in an array, a GPU need not be waited for.
+                Later resets reuse values without gradients.
 
         Returns:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
 
         Raises:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
-                too stiff for the substeps.
+                too stiff for the substeps; or, on a GPU, a step since the last reset got an action that is not finite.
         """
         _refuse_transforms("TorchEnv.reset")
         options = reset_options(options)
-        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
-        if self._env_state is None and not bool(mask.all()):
+        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs)
+        whole = bool(mask.all())
+        if self._env_state is None and not whole:
             raise ValueError("reset_mask must reset all elements the first time")
+        self._refuse_earlier_actions()
         physics = self._physics
         if (given := options.get("physics")) is not None:
             values = physics_values(given, self.num_particles, self._like)
             check_effect(self.spec, values)
-            physics = merged(self.spec, physics, values, mask, self._like)
+            where = to_device(mask, self.device)
+            physics = values if whole else merged(self.spec, physics, values, where, self._like)
             core.check_stability(self.model, physics)
-        drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
-        index = mask.nonzero()[:, 0]
-        fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
+        drawn = self._initial_positions.draw(seed, mask, options.get("positions"), self._like)
+        index = to_device(np.flatnonzero(mask), self.device)
+        chosen = tree.map(Tensor.clone if whole else lambda t: t[index], (drawn.positions, physics))
+        fresh, observation = core.reset(self.model, *chosen)
         info = core.info_of(self.model, fresh, fresh.start)
-        if len(index) < self.num_envs:
-            old = self.env_state
+        actuation = None
+        if not whole:
+            old, where = self.env_state, to_device(mask, self.device)
             now = features_of(old.particles, self.model.num_robot_particles)
             kept = replace(old, physics={}), self.observation(), core.info_of(self.model, old, now)
             others = replace(fresh, physics={}), observation, info
             fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
-            fresh = replace(fresh, physics=merged(self.spec, old.physics, physics, mask, self._like))
+            fresh = replace(fresh, physics=merged(self.spec, old.physics, physics, where, self._like))
+            actuation = self._actuation_without(where)
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
-        self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
+        if drawn is not self._initial_positions:
+            self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
-        self._env_state, self._actuation, self._observation = fresh, self._actuation_of_others(mask), observation
+        self._env_state, self._actuation, self._observation = fresh, actuation, observation
         return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
+
+        On a GPU it returns before the step is done, and does not wait for what only the device knows: an action that is
+        not finite ends its element with :data:`dittogym.core.FAILURE_REWARD`, and the next reset, of any elements,
+        raises the error. Without gradients, the third step is recorded as a CUDA graph, which later steps replay; the
+        task's reward function is not part of it.
 
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
@@ -292,7 +312,7 @@ class TorchEnv:
             task defines it, and the task's own quantities.
 
         Raises:
-            ValueError: The action has the wrong shape or type or is not finite.
+            ValueError: The action has the wrong shape or type or, on the CPU, is not finite.
             RuntimeError: It is called under a transform of ``torch.func`` or in a backward pass.
         """
         _refuse_transforms("TorchEnv.step")
@@ -303,7 +323,8 @@ class TorchEnv:
             )
         checks.flag("soft", soft)
         action = to_grid_layout(self._checked(action), self.action_layout)
-        result = core.evaluate(self.model, *core.advance(self.model, self.env_state, action), soft=soft)
+        simulate = core.simulate if self._replayed is None or torch.is_grad_enabled() else self._replayed
+        result = core.judge(self.model, simulate(self.model, self.env_state, action), soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
@@ -326,10 +347,18 @@ class TorchEnv:
                 "sets its last two numbers"
             )
         action = action.to(self.device, self.dtype)
+        if self._unread is not None:
+            self._unread = self._unread + (action.detach() * 0.0).sum()
         # A sum that is finite spares the test of every entry; one of finite entries may overflow.
-        if not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):
+        elif not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):
             raise ValueError(f"action must be finite, got {wrong} entries that are NaN or infinite")
         return action
+
+    def _refuse_earlier_actions(self) -> None:
+        """Raise the error that steps on a GPU would have had to wait for."""
+        if self._unread is not None and math.isnan(float(self._unread)):
+            self._unread = torch.zeros_like(self._unread)
+            raise ValueError("action must be finite, got NaN or infinite entries in a step since the last reset")
 
     def soft_observation(self) -> Tensor:
         """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
@@ -400,15 +429,15 @@ def find_substeps(dt: float, substeps: int | None) -> int:
     return count
 
 
-def find_mask(name: str, given: Any, num_envs: int, device: torch.device) -> Tensor:
-    """A mask of elements, (B,) bool; ``None`` stands for all."""
+def find_mask(name: str, given: Any, num_envs: int) -> np.ndarray:
+    """A mask of elements, (B,) bool, of its own memory on the host; ``None`` stands for all."""
     if given is None:
-        return torch.ones(num_envs, dtype=torch.bool, device=device)
+        return np.ones(num_envs, dtype=bool)
     try:
-        mask = torch.as_tensor(given, device=device)
+        mask = np.array(given.detach().cpu().numpy() if isinstance(given, Tensor) else given)
     except (TypeError, ValueError, RuntimeError):
         mask = None
-    if mask is None or mask.dtype != torch.bool or mask.shape != (num_envs,):
+    if mask is None or mask.dtype != bool or mask.shape != (num_envs,):
         raise ValueError(f"{name} must be bool of shape ({num_envs},), got {given!r}")
     return mask
 

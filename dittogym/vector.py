@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, spaces
+from dittogym.copies import to_device, to_host
+from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, flat, spaces
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
@@ -22,28 +23,37 @@ from torchmpm import checks
 
 
 class AutoresetStep(NamedTuple):
-    """A step of a batch with a leading B throughout."""
+    """A step of a batch with a leading B throughout; all but the observation on the host."""
 
     observation: Tensor  # Of new episodes where done
-    final_observation: Tensor  # After the step, before any reset
-    reward: Tensor  # (B,)
-    terminated: Tensor  # (B,) bool
-    truncated: Tensor  # (B,) bool
-    done: Tensor  # (B,) bool, elements whose episode ended and that were reset
-    info: dict[str, Any]  # Of the step
-    reset_info: dict[str, Any] | None  # Of all elements after the reset; None if no episode ended
+    reward: np.ndarray  # (B,)
+    terminated: np.ndarray  # (B,) bool
+    truncated: np.ndarray  # (B,) bool
+    done: np.ndarray  # (B,) bool, elements whose episode ended and that were reset
+    info: dict[str, np.ndarray]  # Of the step
+    finals: dict[int, np.ndarray]  # Of elements whose episode ended, the observation after the step
+    reset_info: dict[str, Any]  # Of all elements after the reset, still tensors; empty if no episode ended
 
 
-def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | Tensor | None) -> AutoresetStep:
-    """Step all elements, and reset those whose episode has ended; ``max_episode_steps`` may differ, (B,)."""
-    observation, reward, terminated, truncated, info = env.step(action)
+def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | np.ndarray | None) -> AutoresetStep:
+    """Step all elements, and reset those whose episode has ended; ``max_episode_steps`` may differ, (B,).
+
+    A GPU is waited for once, by the copy of all quantities of the step, and again where an episode has ended.
+    """
+    observation, *own, raw = env.step(action)
+    names = ("reward", "terminated", "truncated")
+    quantities = dict(zip(names, own, strict=True)) | {"steps": env.env_state.steps}
+    info = to_host(flat(raw) | {f"_{name}": value for name, value in quantities.items()})
+    reward, terminated, truncated, steps = (info.pop(f"_{name}") for name in quantities)
     if max_episode_steps is not None:
-        truncated = env.env_state.steps >= max_episode_steps
-    done, final_observation, reset_info = terminated | truncated, observation, None
-    if bool(done.any()):
-        final_observation = observation.clone()  # an environment may reuse its memory
-        observation, reset_info = env.reset(options={"reset_mask": done})
-    return AutoresetStep(observation, final_observation, reward, terminated, truncated, done, info, reset_info)
+        truncated = steps >= max_episode_steps
+    done, finals, reset_info = terminated | truncated, {}, {}
+    if done.any():
+        ended = np.flatnonzero(done)
+        images = to_host({"": observation[to_device(ended, observation.device)]})[""]
+        finals = dict(zip(ended.tolist(), images, strict=True))
+        observation, reset_info = env.reset(options={"reset_mask": torch.from_numpy(done)})
+    return AutoresetStep(observation, reward, terminated, truncated, done, info, finals, reset_info)
 
 
 class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -140,30 +150,33 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             return self._step_then_reset(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
-        rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
-        images, info, done = as_numpy(step.observation), as_numpy(step.info), _array(step.done)
-        result = _restarted(info, as_numpy(step.reset_info or {}), done)
-        if done.any():
-            finals, final = as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
-            for i in np.flatnonzero(done):
-                final[i] = finals[i]
+        result, done = _restarted(step.info, as_numpy(step.reset_info), step.done), step.done
+        if step.finals:
+            final = np.empty(self.num_envs, dtype=object)
+            for i, image in step.finals.items():
+                final[i] = image
             result |= {"final_obs": final, "_final_obs": done}
-            result |= {"final_info": _with_masks(info, done), "_final_info": done}
-        return images, rewards, ends, limits, result
+            result |= {"final_info": _with_masks(step.info, done), "_final_info": done}
+        rewards = step.reward.astype(np.float64)
+        return as_numpy(step.observation), rewards, step.terminated, step.truncated, result
 
     def _step_then_reset(self, action: torch.Tensor) -> tuple[Any, ...]:
         """A step after which, in the mode ``NEXT_STEP``, elements that had ended before it are reset."""
         fresh = self._ended.copy()
-        ended = torch.as_tensor(fresh, device=action.device)
+        ended = to_device(fresh, action.device)
         action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
-        observation, reward, terminated, _, raw = self.torch_env.step(action)
-        limits = _array(self.torch_env.env_state.steps >= self._horizon) & ~fresh
-        rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
+        observation, *own, _, raw = self.torch_env.step(action)
+        names = ("_reward", "_terminated", "_steps")
+        quantities = dict(zip(names, (*own, self.torch_env.env_state.steps), strict=True))
+        info = to_host(flat(raw) | quantities)  # in one piece: a GPU is waited for once
+        reward, terminated, steps = (info.pop(name) for name in names)
+        rewards, ends, limits = reward.astype(np.float64) * ~fresh, terminated & ~fresh, steps >= self._horizon
+        limits &= ~fresh
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = ends | limits
         start: dict[str, Tensor] = {}
         if fresh.any():
-            observation, start = self.torch_env.reset(options={"reset_mask": ended})
+            observation, start = self.torch_env.reset(options={"reset_mask": fresh})
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:

@@ -23,7 +23,7 @@ from baselines.planning.gradient import GradientPlannerConfig
 from baselines.planning.mpc import planner_preset
 from baselines.registry import configure, find
 from cfp.agent.actor import Actor, build_actor
-from cfp.analytic.critic import descend
+from cfp.analytic.critic import check_norms, descend
 from cfp.analytic.window import Episodes
 from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
 from cfp.envs import disturbances
@@ -213,7 +213,7 @@ class Collector(Resumable):
         steps: int,
         beta: float,
         student: Callable[[Tensor], Tensor],
-        after_step: Callable[[Tensor, list[dict[str, Any]]], bool],
+        after_step: Callable[[np.ndarray, list[dict[str, Any]]], bool],
     ) -> Labels | None:
         """Act for some control steps and return the labels; None if ``after_step`` returns False.
 
@@ -245,14 +245,14 @@ class Collector(Resumable):
     def _enlarge(self, action: Tensor) -> Tensor:
         return project(action, self.env.action_resolution, self.env.spec.patch)
 
-    def _step(self, action: Tensor) -> tuple[Tensor, Tensor, list[dict[str, Any]]]:
+    def _step(self, action: Tensor) -> tuple[Tensor, np.ndarray, list[dict[str, Any]]]:
         """Carry out an action, start new episodes where they are over; the next observation, which, and their infos."""
         observation, reward, terminated, _, info = self.env.step(action)
-        done = self.episodes.record(reward, terminated)
-        infos = self.episodes.infos(done)
-        if bool(done.any()):
-            self.episodes.restart(done, terminated, info["finite"])
-            self.restarted = self.restarted | done
+        outcome = self.episodes.read(self.episodes.record(reward, terminated), terminated, info["finite"])
+        infos, done = self.episodes.infos(outcome), outcome.values["done"]
+        if done.any():
+            self.episodes.restart(outcome)
+            self.restarted = self.restarted | outcome.done
             observation = self.env.observation()
         return observation, done, infos
 
@@ -375,7 +375,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             raise NonFiniteError(f"the loss became {value} after {self.num_timesteps} environment steps of the stage")
         self.adam.zero_grad()
         loss.backward()
-        descend(self.adam, self.config.max_grad_norm, "student's loss")
+        check_norms([descend(self.adam, self.config.max_grad_norm)], "student's loss")
         return value
 
     def predict(

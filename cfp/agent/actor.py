@@ -419,6 +419,10 @@ def standard_deviation(raw_std: Tensor) -> Tensor:
     return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
 
 
+def _normal_like(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.randn(like.shape, generator=generator, device=generator.device).to(like)
+
+
 def sample_squashed_gaussian(
     mean: Tensor,
     raw_std: Tensor,
@@ -427,12 +431,12 @@ def sample_squashed_gaussian(
 ) -> tuple[Tensor, Tensor]:
     """Sample tanh(mean + s eps) with s from `standard_deviation`, and its log-density (B,).
 
-    A ``generator``, if given, belongs to the CPU, whatever the device of the networks.
+    A ``generator``, if given, may belong to the CPU, whatever the device of the networks.
     """
     std = standard_deviation(raw_std)
     noise = torch.zeros_like(mean)
     if not deterministic:
-        noise = noise.normal_() if generator is None else torch.randn(mean.shape, generator=generator).to(mean)
+        noise = noise.normal_() if generator is None else _normal_like(mean, generator)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv
+from dittogym.copies import constant
 from dittogym.geometry import centre_in_window
 from torchmpm.transfer import quadratic_weights
 
@@ -102,7 +104,7 @@ def _rasterise(position: Tensor, values: Tensor) -> Tensor:
 
 def _clock(steps: Tensor) -> Tensor:
     """Cosine and sine (B, 6) of steps (B,) for every period."""
-    angle = steps[:, None] * (2.0 * math.pi / torch.tensor(PERIODS, device=steps.device))
+    angle = steps[:, None] * (2.0 * math.pi / constant(PERIODS, steps))
     return torch.cat((angle.cos(), angle.sin()), 1)
 
 
@@ -118,12 +120,23 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, last)
 
 
-def descend(adam: torch.optim.Adam, max_norm: float, name: str) -> None:
-    """Take a step along the gradient of ``name``, clipped to a norm; a `NonFiniteError` if it is not finite."""
+def make_adam(parameters: Iterable[nn.Parameter], learning_rate: float, betas: tuple[float, float]) -> torch.optim.Adam:
+    """Adam; on a GPU the fused one, which launches a kernel or two."""
+    parameters = list(parameters)
+    return torch.optim.Adam(parameters, learning_rate, betas, fused=parameters[0].is_cuda or None)
+
+
+def descend(adam: torch.optim.Adam, max_norm: float) -> Tensor:
+    """Take a step along the gradient, clipped to a norm; returns the norm that it had, for `check_norms`."""
     norm = nn.utils.clip_grad_norm_(adam.param_groups[0]["params"], max_norm)
-    if not torch.isfinite(norm):
-        raise NonFiniteError(f"the gradient of the {name} is not finite")
     adam.step()
+    return norm
+
+
+def check_norms(norms: Sequence[Tensor], name: str) -> None:
+    """Raise a `NonFiniteError` if one of the norms of the gradients of ``name`` is not finite."""
+    if norms and not bool(torch.stack(list(norms)).isfinite().all()):
+        raise NonFiniteError(f"the gradient of the {name} is not finite")
 
 
 class Critic(Resumable):
@@ -139,7 +152,7 @@ class Critic(Resumable):
     def __init__(self, network: nn.Module, options: WindowConfig) -> None:
         self.network, self.options = network, options
         self.target = copy.deepcopy(network).requires_grad_(False)
-        self.adam = torch.optim.Adam(network.parameters(), options.learning_rate, BETAS)
+        self.adam = make_adam(network.parameters(), options.learning_rate, BETAS)
 
     def __call__(self, observations: Tensor) -> Tensor:
         """Values (B,) of the target network."""
@@ -154,11 +167,12 @@ class Critic(Resumable):
         """Learn the values of a window's states; returns the last mean squared error."""
         self.adam.param_groups[0]["lr"] = learning_rate
         targets = td_lambda_targets(window, self.options.gamma, self.options.td_lambda).flatten()
-        observations, loss = window.observations.flatten(0, 1), torch.zeros(())
+        observations, loss, norms = window.observations.flatten(0, 1), torch.zeros(()), []
         for _ in range(self.options.critic_updates):
             self.adam.zero_grad()
             loss = (self._value(self.network, observations) - targets).square().mean()
             loss.backward()
-            descend(self.adam, self.options.max_grad_norm, "critic")
+            norms.append(descend(self.adam, self.options.max_grad_norm))
+        check_norms(norms, "critic")
         get_ema_multi_avg_fn(1 - self.options.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
         return float(loss.detach())

@@ -12,16 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.analytic.critic import Critic, StateFeatures, descend, mlp
+from cfp.analytic.critic import Critic, StateFeatures, check_norms, descend, make_adam, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
 from cfp.learner import (
+    AveragedWeights,
     CoarseToFine,
     NetworksPolicy,
     Resumable,
@@ -83,11 +83,12 @@ class ActionStep(Resumable):
         """
         gradients = gradients.double()  # squares of outliers overflow in single precision
         norms = gradients.flatten(2).norm(dim=2)
-        self.norms = [*self.norms, *norms[norms > 0].tolist()][-HISTORY:]
+        found = norms.cpu().numpy()
+        self.norms = [*self.norms, *found[found > 0].tolist()][-HISTORY:]
         if not self.norms:
             return locations.clone()
         largest = OUTLIER * float(np.median(self.norms))
-        self.limited += int((norms > largest).sum())
+        self.limited += int((found > largest).sum())
         gradients = gradients * (largest / norms.clamp_min(largest))[..., None, None, None]
         step = size * gradients / gradients.square().mean().sqrt().clamp_min(torch.finfo(torch.double).tiny)
         return (locations - step.to(locations)).clamp(-BOUND, BOUND)
@@ -116,7 +117,7 @@ class ImageMemory(Resumable):
     def sample(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A random batch of pairs, with replacement."""
         stored = min(self.count, len(self.images))
-        index = torch.randint(stored, (size,), generator=generator).to(self.images.device)
+        index = torch.randint(stored, (size,), generator=generator, device=generator.device).to(self.images.device)
         return self.images[index], self.locations[index]
 
     def state_dict(self) -> dict[str, Any]:
@@ -146,18 +147,22 @@ class Regression(Resumable):
 
     def __init__(self, actor: Actor, learning_rate: float, decay: float, max_grad_norm: float) -> None:
         self.actor, self.max_grad_norm = actor, max_grad_norm
-        self.average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        self.adam = torch.optim.Adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
+        self.average = AveragedWeights(actor, decay)
+        self.adam = make_adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
 
-    def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> Tensor:
-        """Take one step of Adam towards the ``locations`` of actions for ``images``; returns the mean squared error."""
+    def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> tuple[Tensor, Tensor]:
+        """Take one step of Adam towards the ``locations`` of actions for ``images``.
+
+        Returns:
+            The mean squared error, and the norm of its gradient, for `check_norms`.
+        """
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
         loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)
         loss.backward()
-        descend(self.adam, self.max_grad_norm, "actor's regression")
+        norm = descend(self.adam, self.max_grad_norm)
         self.average.update_parameters(self.actor)
-        return loss.detach()
+        return loss.detach(), norm
 
 
 class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
@@ -192,7 +197,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         self.critic = Critic(critic, config)
         networks = {"learned": self.actor, "value": critic, "target": self.critic.target}
         self.policy = NetworksPolicy(self.observation_space, self.action_space, self.trained_actor, **networks)
-        self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
+        self.generator = torch.Generator(self.device).manual_seed(config.seed)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
 
@@ -263,10 +268,12 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             return False
         images, improved, window = played
         self.memory.add(images, improved.flatten(0, 1))
-        regression_loss = torch.zeros(())
+        regression_loss, norms = torch.zeros(()), list[Tensor]()
         for _ in range(minibatches):
             batch = self.memory.sample(config.minibatch_size, self.generator)
-            regression_loss = self.regression.update(*batch, learning_rate)
+            regression_loss, norm = self.regression.update(*batch, learning_rate)
+            norms.append(norm)
+        check_norms(norms, "actor's regression")
         critic_loss = self.critic.update(window, learning_rate)
         own = {
             "train/critic_loss": critic_loss,

@@ -17,9 +17,10 @@ from torch import Tensor
 from cfp.config import WindowConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv, first_limits
-from cfp.errors import NonFiniteError
+from cfp.errors import ConfigError, NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv, core
+from dittogym.copies import to_host
 from dittogym.rewards import Reward, Transition
 from dittogym.spec import TaskSpec
 from torchmpm import tree
@@ -43,6 +44,10 @@ NEIGHBOURS, MAX_SAMPLES = 6, 500
 RADIUS = 0.03
 #: Fraction of ``RADIUS`` by which they may drift apart at no cost.
 TOLERANCE = 0.25
+#: Memory for the gradients of a window on a GPU, with what going back through it needs, in what its steps keep.
+BACKWARD = 1.25
+#: What is wrong with actions that are not finite.
+DIVERGED = "the actor's actions became NaN or infinite"
 
 
 # The training reward.
@@ -144,6 +149,13 @@ class Window(NamedTuple):
     true_reward: float  # mean of the task's own rewards
 
 
+class Outcome(NamedTuple):
+    """Which episodes of a batch are over after a step, and what else the host has to know of the step."""
+
+    done: Tensor  # (B,) bool
+    values: dict[str, np.ndarray]  # by name: the same, and what `Episodes.read` was given; copied in one piece
+
+
 class Episodes(Resumable):
     """Ends the episodes of an environment and starts new ones.
 
@@ -171,27 +183,32 @@ class Episodes(Resumable):
         self.returns = self.returns + reward  # not in place: a saved state may hold it
         return terminated | (self.env.env_state.steps >= self.limit)
 
-    def infos(self, done: Tensor) -> list[dict[str, Any]]:
-        """Return and length of each episode that is ``done`` (B,), as stable-baselines3's ``Monitor`` reports them."""
-        infos: list[dict[str, Any]] = [{} for _ in range(len(done))]
-        for i in done.nonzero()[:, 0].tolist():
-            infos[i]["episode"] = {"r": float(self.returns[i]), "l": int(self.env.env_state.steps[i])}
+    def read(self, done: Tensor, terminated: Tensor, finite: Tensor, **others: Tensor) -> Outcome:
+        """What happened in the step that `record` was told of, with ``others`` by name, on the host."""
+        own = {"done": done, "terminated": terminated, "finite": finite, "return": self.returns}
+        return Outcome(done, to_host(own | {"length": self.env.env_state.steps} | others))
+
+    def infos(self, outcome: Outcome) -> list[dict[str, Any]]:
+        """Return and length of each episode that is over, as stable-baselines3's ``Monitor`` reports them."""
+        values, infos = outcome.values, [dict[str, Any]() for _ in range(self.env.num_envs)]
+        for i in np.flatnonzero(values["done"]).tolist():
+            infos[i]["episode"] = {"r": float(values["return"][i]), "l": int(values["length"][i])}
         return infos
 
-    def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:
-        """Start new episodes where ``done`` (B,), each on the next layout; count how they ended."""
-        seeds = [0] * self.env.num_envs
-        for i in done.nonzero()[:, 0].tolist():
+    def restart(self, outcome: Outcome) -> None:
+        """Start new episodes where they are over, each on the next layout; count how they ended."""
+        values, seeds = outcome.values, [0] * self.env.num_envs
+        for i in np.flatnonzero(values["done"]).tolist():
             self.counts["episodes"] += 1
-            self.counts["terminated"] += int(terminated[i])
-            self.counts["nonfinite"] += int(~finite[i])
-            self.recent_returns.append(float(self.returns[i]))
+            self.counts["terminated"] += int(values["terminated"][i])
+            self.counts["nonfinite"] += int(not values["finite"][i])
+            self.recent_returns.append(float(values["return"][i]))
             seeds[i] = self.first_seed + self.num_started % self.num_layouts
             self.num_started += 1
-        if bool(done.any()):
-            self.env.reset(seed=seeds, options={"reset_mask": done})
-        self.returns = torch.where(done, 0.0, self.returns)
-        self.limit = torch.where(done, self.max_steps, self.limit)
+        if values["done"].any():
+            self.env.reset(seed=seeds, options={"reset_mask": values["done"]})
+        self.returns = torch.where(outcome.done, 0.0, self.returns)
+        self.limit = torch.where(outcome.done, self.max_steps, self.limit)
 
     def scalars(self) -> dict[str, float | None]:
         """Counts, and the mean of `recent_returns`."""
@@ -228,13 +245,15 @@ class WindowCollector(Resumable):
         self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
         self.config = config
         self.success_value = config.reward_scale * config.success_reward / discount_rate(config.gamma)
-        self.dropped = self.dropped_before = 0
+        self.dropped = 0  # in the windows whose scalars were read
+        self._dropped_now = torch.zeros((), dtype=torch.int64, device=env.device)
+        self._is_measured = env.device.type == "cpu"  # the memory that a step keeps for gradients
 
     def collect(
         self,
         act: Callable[[Tensor], Tensor],
         value: Callable[[Tensor], Tensor],
-        after_step: Callable[[Tensor, list[dict[str, Any]]], bool],
+        after_step: Callable[[np.ndarray, list[dict[str, Any]]], bool],
     ) -> Window | None:
         """Collect the next window.
 
@@ -249,29 +268,39 @@ class WindowCollector(Resumable):
 
         Raises:
             NonFiniteError: Actions are not finite.
+            ConfigError: A GPU has too little free memory for the gradients of a window.
         """
         env, true_reward = self.env, 0.0
-        self.dropped_before = self.dropped
+        self._dropped_now = torch.zeros_like(self._dropped_now)
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
         for _ in range(self.config.window):
-            centre = env.env_state.centre
-            _, smooth_reward, terminated, _, info = env.step(self._guarded(act(observation)), soft=True)
+            centre, memory = env.env_state.centre, 0 if self._is_measured else torch.cuda.memory_allocated(env.device)
+            action = self._guarded(act(observation))
+            _, smooth_reward, terminated, _, info = env.step(action, soft=True)
             reward = training_reward(self.config, env, centre, smooth_reward, info, neighbours).float()
             next_observation = self.observe()
             success = info.get("is_success", terminated.new_zeros(()))
             final_value = torch.where(success, self.success_value, 0.0)
             next_value = torch.where(terminated, final_value, value(next_observation))
-            true_reward += float(info["true_reward"].detach().mean())
-            is_over = self.episodes.record(info["true_reward"].detach(), terminated)
+            true_rewards = info["true_reward"].detach()
+            is_over = self.episodes.record(true_rewards, terminated)
             steps.append((observation.detach(), reward, next_value, is_over))
-            infos = self.episodes.infos(is_over)
-            if bool(is_over.any()):
-                self.episodes.restart(is_over, terminated, info["finite"])
+            if not self._is_measured and torch.is_grad_enabled():
+                check_gradient_memory(env, self.config.window, torch.cuda.memory_allocated(env.device) - memory)
+                self._is_measured = True
+            further = {"true_reward": true_rewards.mean(), "acts": action.detach().isfinite().all()}
+            outcome = self.episodes.read(is_over, terminated, info["finite"], **further)
+            if not outcome.values["acts"]:
+                raise NonFiniteError(DIVERGED)
+            true_reward += float(outcome.values["true_reward"])
+            infos = self.episodes.infos(outcome)
+            if outcome.values["done"].any():
+                self.episodes.restart(outcome)
                 neighbours = tree.where(is_over, Neighbours.find(self._robot_positions()), neighbours)
                 next_observation = tree.where(is_over, self.observe(), next_observation)
             observation = next_observation
-            if not after_step(is_over, infos):
+            if not after_step(outcome.values["done"], infos):
                 env.detach()
                 return None
         observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))
@@ -279,13 +308,17 @@ class WindowCollector(Resumable):
 
     def scalars(self, window: Window) -> dict[str, float | None]:
         """What to log of a window, see `WINDOW_METRICS`; warns if most of its gradients were left out."""
-        if self.dropped - self.dropped_before > window.rewards.numel() / 2:
+        means = {"reward": window.rewards.detach().mean(), "value": window.next_values.detach().mean()}
+        values = to_host(means | {"dropped": self._dropped_now})
+        self._dropped_now = torch.zeros_like(self._dropped_now)
+        self.dropped += int(values["dropped"])
+        if values["dropped"] > window.rewards.numel() / 2:
             reason = "the reward or the simulation has no finite derivative there"
             warnings.warn(f"most gradients of a window are not finite and were left out: {reason}", stacklevel=2)
         return self.episodes.scalars() | {
-            "train/reward": float(window.rewards.detach().mean()) / self.config.reward_scale,
+            "train/reward": float(values["reward"]) / self.config.reward_scale,
             "train/true_reward": window.true_reward,
-            "train/value": float(window.next_values.detach().mean()),
+            "train/value": float(values["value"]),
             "train/dropped": float(self.dropped),
         }
 
@@ -294,8 +327,8 @@ class WindowCollector(Resumable):
 
     def _guarded(self, action: Tensor) -> Tensor:
         """The same actions, through which only finite gradients go back."""
-        if not bool(action.isfinite().all()):
-            raise NonFiniteError("the actor's actions became NaN or infinite")
+        if action.device.type == "cpu" and not bool(action.isfinite().all()):  # on a GPU, known after the step
+            raise NonFiniteError(DIVERGED)
         if not action.requires_grad:
             return action
         view = action.view_as(action)
@@ -304,8 +337,21 @@ class WindowCollector(Resumable):
 
     def _drop_nonfinite(self, gradient: Tensor) -> Tensor:
         finite = gradient.isfinite().flatten(1).all(1)
-        self.dropped += int((~finite).sum())
+        self._dropped_now = self._dropped_now + (~finite).sum()
         return torch.where(finite[:, None, None, None], gradient, 0.0)
+
+
+def check_gradient_memory(env: TorchEnv, window: int, kept: int) -> None:
+    """Refuse windows that do not fit into what a GPU has free, given the bytes ``kept`` for gradients of one step."""
+    free = torch.cuda.mem_get_info(env.device)[0]
+    free += torch.cuda.memory_reserved(env.device) - torch.cuda.memory_allocated(env.device)
+    needed = BACKWARD * kept * window
+    if needed - kept > free:
+        fitting = int(env.num_envs * (free + kept) / needed)
+        raise ConfigError(
+            f"num_envs must be at most {fitting} with window {window} on this GPU, got {env.num_envs}: a step keeps "
+            f"{kept / 1e9:.2f} GB for gradients, and {free / 1e9:.1f} GB are free"
+        )
 
 
 def reward_warnings(config: WindowConfig) -> list[str]:

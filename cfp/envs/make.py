@@ -45,10 +45,23 @@ def _automatic_device() -> str:
 
 
 def make_env(
-    config: RunConfig, resolution: int, num_envs: int | None = None, max_episode_steps: int | None = None
+    config: RunConfig,
+    resolution: int,
+    num_envs: int | None = None,
+    max_episode_steps: int | None = None,
+    tensors: bool = False,
 ) -> VecMonitor:
     """Create the environment of a run for stable-baselines3, see `make_torch_env` and `TorchVecEnv`."""
-    return monitored(make_torch_env(config, resolution, num_envs), max_episode_steps)
+    return monitored(make_torch_env(config, resolution, num_envs), max_episode_steps, tensors)
+
+
+def gpu_memory(device: str) -> int | None:
+    """Bytes of memory of the GPU that ``device`` stands for; 0: it is the CPU, None: there is no such GPU."""
+    try:
+        found = choose_device(device)
+    except ConfigError:
+        return None if device.startswith("cuda") else 0
+    return 0 if found == "cpu" else int(torch.cuda.get_device_properties(found).total_memory)
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:

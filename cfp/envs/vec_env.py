@@ -15,8 +15,12 @@ from torch import Tensor
 
 from cfp.errors import NonFiniteError
 from dittogym import env as dittogym_env
+from dittogym.copies import to_device
 from dittogym.vector import autoreset_step
 from torchmpm import tree
+
+#: What is wrong with actions that are not finite.
+DIVERGED = "an action is not finite: the policy has diverged"
 
 
 class TorchVecEnv(VecEnv):
@@ -32,6 +36,8 @@ class TorchVecEnv(VecEnv):
         max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
             After a reset of all elements, the first episode of element i is truncated after a fraction
             ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
+        tensors: Observations are tensors on the device, and so may actions be: of a GPU only numbers, and the last
+            images of episodes, are copied to the host.
     """
 
     def __init__(
@@ -39,24 +45,26 @@ class TorchVecEnv(VecEnv):
         env: Any,
         spaces: tuple[Space[Any], Space[Any]] | None = None,
         max_episode_steps: int | None = None,
+        tensors: bool = False,
     ) -> None:
-        self.torch_env = env
+        self.torch_env, self.tensors = env, tensors
         self.max_episode_steps = None if max_episode_steps is None else min(max_episode_steps, env.spec.horizon)
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None
+        self._are_finite: bool | Tensor = True  # these actions
         self._limits = self._first_limits()
 
-    def _first_limits(self) -> Tensor | None:
+    def _first_limits(self) -> np.ndarray | None:
         limit = self.max_episode_steps
-        return None if limit is None else first_limits(self.num_envs, limit, self.torch_env.device)
+        return None if limit is None else first_limits(self.num_envs, limit, torch.device("cpu")).numpy()
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
         """Start new episodes in all elements, with the seed and options set since the last reset.
 
         Returns:
-            uint8 (B, 3, 64, 64).
+            uint8 (B, 3, 64, 64), a tensor with ``tensors``.
 
         Raises:
             ValueError: The options are not one dictionary for all elements, see `dittogym.TorchEnv.reset`.
@@ -69,18 +77,26 @@ class TorchVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self._limits = self._first_limits()
-        self.reset_infos = self._split_info(info)
-        return _to_numpy(observation)
+        self.reset_infos = _split(dittogym_env.as_numpy(info))
+        return self._as_returned(observation)
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """Set the actions (B, 2, R, R), float, of the next step.
+    def _as_returned(self, observation: Tensor) -> Any:
+        # A copy, because the environment may use its memory again.
+        return observation.clone() if self.tensors else dittogym_env.as_numpy(observation)
+
+    def step_async(self, actions: Any) -> None:
+        """Set the actions (B, 2, R, R), float, of the next step; with ``tensors`` they may be a tensor.
 
         Raises:
-            NonFiniteError: An action is NaN or infinite.
+            NonFiniteError: An action is NaN or infinite; of a tensor, ``step_wait`` raises it.
         """
+        if isinstance(actions, Tensor):
+            self._are_finite = actions.isfinite().all()
+            self._actions = torch.where(self._are_finite, actions, 0.0)
+            return
         if not np.isfinite(actions).all():
-            raise NonFiniteError("an action is not finite: the policy has diverged")
-        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.torch_env.device)
+            raise NonFiniteError(DIVERGED)
+        self._actions, self._are_finite = to_device(np.array(actions, np.float32), self.torch_env.device), True
 
     @torch.no_grad()
     def step_wait(self) -> VecEnvStepReturn:
@@ -88,27 +104,22 @@ class TorchVecEnv(VecEnv):
         assert self._actions is not None, "step_async must be called first"
         step = autoreset_step(self.torch_env, self._actions, self._limits)
         self._actions = None
-        if self._limits is not None and self.max_episode_steps is not None:
-            self._limits = torch.where(step.done, self.max_episode_steps, self._limits)
-        infos, done = self._split_info(step.info), _to_numpy(step.done)
-        if done.any():
-            finals, timed_out = _to_numpy(step.final_observation), _to_numpy(step.truncated)
-            for index in np.flatnonzero(done):
-                infos[index]["terminal_observation"] = finals[index]
-                infos[index]["TimeLimit.truncated"] = bool(timed_out[index])
-        return _to_numpy(step.observation), _to_numpy(step.reward.float()), done, infos
-
-    def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""
-        columns = {key: value.tolist() for key, value in dittogym_env.flat(info).items()}
-        return [{key: value[index] for key, value in columns.items()} for index in range(self.num_envs)]
+        if not self._are_finite:  # on a GPU, which the step has waited for already
+            raise NonFiniteError(DIVERGED)
+        if self._limits is not None:
+            self._limits[step.done] = self.max_episode_steps
+        infos = _split(step.info)
+        for index, image in step.finals.items():
+            infos[index]["terminal_observation"] = image
+            infos[index]["TimeLimit.truncated"] = bool(step.truncated[index])
+        return self._as_returned(step.observation), step.reward.astype(np.float32), step.done, infos
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
         return [value.detach().cpu().clone() for value in self._state()]
 
     def _state(self) -> list[Tensor]:
-        limits = [] if self._limits is None else [self._limits]
+        limits = [] if self._limits is None else [torch.from_numpy(self._limits)]
         return [*tree.leaves(self.torch_env.env_state), *limits]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
@@ -125,7 +136,7 @@ class TorchVecEnv(VecEnv):
         values = iter(state)
         self.torch_env.env_state = tree.map(lambda value: next(values).to(value), self.torch_env.env_state)
         if self._limits is not None:
-            self._limits = next(values).to(self._limits)
+            self._limits = next(values).numpy().copy()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """One picture, uint8 (512, 512, 3), per element."""
@@ -168,10 +179,15 @@ class TorchVecEnv(VecEnv):
         return [False for _ in self._indices(indices)]
 
 
-def _to_numpy(tensor: Tensor) -> np.ndarray:
-    """Copy a tensor, because the environment may reuse its memory."""
-    array: np.ndarray = tensor.detach().cpu().numpy().copy()
-    return array
+def _split(info: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Turn one dictionary of arrays with a leading B into B dictionaries of numbers."""
+    columns = [array.tolist() for array in info.values()]
+    return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def keeps_tensors(env: Any) -> bool:
+    """Whether a vectorised environment is, or wraps, a `TorchVecEnv` whose observations are tensors."""
+    return bool(getattr(getattr(env, "unwrapped", env), "tensors", False))
 
 
 def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
@@ -179,6 +195,6 @@ def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
     return (torch.arange(1, num_envs + 1, device=device) * max_steps // num_envs).clamp(min=1)
 
 
-def monitored(env: Any, max_episode_steps: int | None = None) -> VecMonitor:
+def monitored(env: Any, max_episode_steps: int | None = None, tensors: bool = False) -> VecMonitor:
     """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
-    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps))
+    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps, tensors=tensors))

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import pickle
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
+from torch import Tensor
 
 from cfp.config import RunConfig, differences, to_json
 from cfp.errors import CheckpointError, ConfigError
@@ -26,6 +30,10 @@ UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EO
 
 #: Arrays of a replay buffer that are stored.
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+#: Transitions in a chunk at most, so that several threads can write what a GPU has collected.
+LARGEST_CHUNK = 2**15
+#: These threads; each copies a chunk from the GPU.
+WRITERS = 8
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise
 
 
@@ -53,13 +61,22 @@ class ReplayArchive:
         oldest = max(0, rows - buffer.buffer_size)
         start = max(oldest, self.chunks[-1].stop if self.chunks else 0)
         if start < rows:
-            chunk = Chunk(f"stage{self.stage}-{start:09d}-{rows:09d}.npz", start, rows)
-            index = np.arange(start, rows) % buffer.buffer_size
-            arrays = {name: getattr(buffer, name)[index] for name in FIELDS}
-            write_atomically(self.folder / chunk.file, lambda file: _write_arrays(file, arrays))
-            self.chunks.append(chunk)
+            length = max(1, LARGEST_CHUNK // buffer.n_envs)
+            stops = [*range(start + length, rows, length), rows]
+            chunks = [
+                Chunk(f"stage{self.stage}-{first:09d}-{stop:09d}.npz", first, stop)
+                for first, stop in pairwise([start, *stops])
+            ]
+            with ThreadPoolExecutor(WRITERS) as pool:  # compression leaves Python's lock to the others
+                list(pool.map(partial(self._write, buffer), chunks))
+            self.chunks += chunks
         self.chunks = [chunk for chunk in self.chunks if chunk.stop > oldest]
         return [asdict(chunk) for chunk in self.chunks]
+
+    def _write(self, buffer: ReplayBuffer, chunk: Chunk) -> None:
+        index = np.arange(chunk.start, chunk.stop) % buffer.buffer_size
+        arrays = {name: _as_array(getattr(buffer, name)[index]) for name in FIELDS}
+        write_atomically(self.folder / chunk.file, lambda file: _write_arrays(file, arrays))
 
     def prune(self) -> None:
         """Delete every chunk that the list does not name; call it once the checkpoint is in place."""
@@ -83,11 +100,16 @@ class ReplayArchive:
                 ring = getattr(buffer, name)
                 if values.shape[1:] != ring.shape[1:]:
                     raise ValueError(f"{chunk.file}: {name} must have shape {ring.shape[1:]}, got {values.shape[1:]}")
-                ring[index] = values[first - chunk.start :]
+                values = values[first - chunk.start :]
+                ring[index] = torch.from_numpy(values).to(ring.device) if isinstance(ring, Tensor) else values
         if stop != rows:
             raise CheckpointError(f"{self.folder}: rows {stop} to {rows} of the replay buffer are missing")
         buffer.pos = rows % buffer.buffer_size
         buffer.full = rows >= buffer.buffer_size
+
+
+def _as_array(rows: np.ndarray | Tensor) -> np.ndarray:
+    return rows.cpu().numpy() if isinstance(rows, Tensor) else rows
 
 
 def _write_arrays(file: BinaryIO, arrays: dict[str, np.ndarray]) -> None:

@@ -25,18 +25,19 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, NetworkInput, upsample
 from cfp.config import Hyperparameters, Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
-from cfp.envs.vec_env import TorchVecEnv
+from cfp.envs.vec_env import TorchVecEnv, keeps_tensors
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import CoarseToFine, Learner, refines
+from cfp.learner import AveragedWeights, CoarseToFine, Learner, generator_state, refines, restore_generator
 from cfp.presets import sac_preset
 from cfp.sac.policies import CFPPolicy, NetworkPolicy, TwinCritic
 from cfp.sac.replay import Composition, ReplayRing
+from dittogym.copies import to_device
 
 #: Every scalar that it logs, and what it means.
 METRICS: dict[str, str] = {
@@ -207,6 +208,10 @@ class CFP(SAC):
     In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
     part only, as in the reference implementation. ``predict`` acts by the actor in training; see ``trained_actor``.
 
+    With an environment whose observations are tensors, see `TorchVecEnv`, observations, actions and the replay memory
+    stay on the device, and updates do not wait for it: their scalars, and whether they were finite, are read when a row
+    is logged and before anything is saved.
+
     Args:
         policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.NetworkPolicy``.
         env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
@@ -259,23 +264,32 @@ class CFP(SAC):
         )
 
     def _setup_model(self) -> None:
+        self.replay_buffer_kwargs["tensors"] = self.on_device
         super()._setup_model()
         own = self.hyperparameters
         self.reward_statistics = RewardStatistics().to(self.device)
+        self._unread: list[tuple[list[str], Tensor]] = []  # names and scalars of each update
+        self._are_finite = torch.ones((), dtype=torch.bool, device=self.device)  # these updates
         self.noise = None
         if own.noise_cells:
             resolution = self.networks()[0].resolution
             self.noise = CellNoise(self.n_envs, resolution, own.noise_cells, own.noise_scale, self.seed)
         self.restart_average()
 
+    @property
+    def on_device(self) -> bool:
+        """Whether observations, actions and transitions stay on the device."""
+        return keeps_tensors(self.env)
+
     def restart_average(self) -> None:
         """Let the average of the actor's weights begin with those it has now."""
         decay, actor = self.hyperparameters.weight_average, self.networks()[0]
-        self.average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(decay)) if decay else None
+        self.average = AveragedWeights(actor, decay) if decay else None
 
     @property
     def trained_actor(self) -> Actor:
         """The actor with averaged weights, or the one in training if there is no average."""
+        self.read_updates()  # so that weights that are not finite are not saved
         return self.networks()[0] if self.average is None else cast(Actor, self.average.module)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
@@ -287,7 +301,8 @@ class CFP(SAC):
         """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
 
         Raises:
-            NonFiniteError: A loss is not finite; the optimiser step is not taken.
+            NonFiniteError: A loss is not finite; the optimiser step is not taken. With ``on_device``, `read_updates`
+                raises it later.
         """
         assert self.replay_buffer is not None
         actor, critic, _ = self.networks()
@@ -296,10 +311,33 @@ class CFP(SAC):
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
-            values = torch.stack(tuple(scalars.values())).tolist()  # waits for the device once, not for each scalar
-            for name, value in zip(scalars, values, strict=True):
-                self.logger.record_mean(f"train/{name}", value)
+            self._unread.append((list(scalars), torch.stack(tuple(scalars.values()))))
+        if not self.on_device:
+            self.read_updates()
         self.logger.record("train/n_updates", self._n_updates)
+
+    def read_updates(self) -> None:
+        """Record the scalars of all updates since the last call, for which it waits for the device once.
+
+        Raises:
+            NonFiniteError: One of the updates was not finite.
+        """
+        unread, self._unread = self._unread, []
+        if not unread:
+            return
+        *values, are_finite = torch.cat([*(each for _, each in unread), self._are_finite[None]]).tolist()
+        if not are_finite:
+            raise NonFiniteError(
+                f"a loss or its gradient is not finite in one of the updates {self._n_updates + 1 - len(unread)} to "
+                f"{self._n_updates} ({self.num_timesteps} environment steps into the stage)"
+            )
+        for name, value in zip((name for names, _ in unread for name in names), values, strict=True):
+            self.logger.record_mean(f"train/{name}", value)
+
+    def dump_logs(self) -> None:
+        """Write a row, see stable-baselines3."""
+        self.read_updates()
+        super().dump_logs()
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
@@ -336,7 +374,10 @@ class CFP(SAC):
         optimizer.zero_grad()
         loss.backward()
         norms = clip_each(optimizer.param_groups[0]["params"], MAX_GRAD_NORM)
-        if not (torch.isfinite(loss) and torch.isfinite(norms).all()):
+        are_finite = torch.isfinite(loss) & torch.isfinite(norms).all()
+        if self.on_device:
+            self._are_finite &= are_finite
+        elif not are_finite:
             raise NonFiniteError(
                 f"the {name} loss {loss.item()} or its gradient is not finite at update {self._n_updates + 1} "
                 f"({self.num_timesteps} environment steps into the stage)"
@@ -353,8 +394,10 @@ class CFP(SAC):
         if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.
             return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
+        if self.on_device:  # the environment checks the actions
+            return self._act(composition)
         if composition is not None or self.noise is not None:
-            actions, stored = self._act(composition)
+            actions, stored = (part.cpu().numpy() for part in self._act(composition))
         else:
             actions, stored = super()._sample_action(0, action_noise, n_envs)
         self._check_finite("action", actions)
@@ -374,19 +417,20 @@ class CFP(SAC):
         return actions, actions if composition is None else composition.from_finest(corner).numpy()
 
     @torch.no_grad()
-    def _act(self, composition: Composition | None) -> tuple[np.ndarray, np.ndarray]:
-        """Act as ``predict`` does, with exploration noise, and keep the parts of the actions."""
+    def _act(self, composition: Composition | None) -> tuple[Any, Any]:
+        """Act as ``predict`` does, with exploration noise, and keep the parts of the actions; returns tensors."""
         assert self._last_obs is not None
         self.policy.set_training_mode(False)
-        observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        assert isinstance(observation, Tensor)
+        observation: Any = self._last_obs
+        if not self.on_device:
+            observation, _ = self.policy.obs_to_tensor(observation)
         actor = self.networks()[0]
         outputs = actor.outputs(observation)
         if self.noise is not None:
-            outputs = outputs._replace(mean=outputs.mean + self.noise().to(outputs.mean.device))
+            noise = to_device(self.noise().numpy(), outputs.mean.device)
+            outputs = outputs._replace(mean=outputs.mean + noise)
         sample = actor.act(outputs)
-        action = sample.action.cpu().numpy()
-        return action, action if composition is None else composition.join(sample.parts).cpu().numpy()
+        return sample.action, sample.action if composition is None else composition.join(sample.parts)
 
     def _store_transition(
         self,
@@ -398,7 +442,15 @@ class CFP(SAC):
         infos: list[dict[str, Any]],
     ) -> None:
         self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if not self.on_device:
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            return
+        next_obs, ended = new_obs, np.flatnonzero(dones)
+        if len(ended):
+            finals = np.stack([infos[index]["terminal_observation"] for index in ended])
+            next_obs = new_obs.index_copy(0, to_device(ended, self.device), to_device(finals, self.device))
+        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
+        self._last_obs = new_obs
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
@@ -413,17 +465,13 @@ class CFP(SAC):
         return [*modules, "reward_statistics", *(["average"] if self.average else [])], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "noise", "average"]
+        return [*super()._excluded_save_params(), "reward_statistics", "noise", "average", "_unread", "_are_finite"]
 
     def state_dict(self) -> dict[str, Any]:
         """All that it learns and counts but ``num_timesteps`` and the replay buffer, as tensors and plain values."""
+        self.read_updates()
         values = self.logger.name_to_value  # of the row that comes next
         monitor, env = self._environments()
-        generators: dict[str, Any] = {"torch": torch.get_rng_state()} | {
-            name: generator.bit_generator.state for name, generator in self._generators().items()
-        }
-        if self.device.type == "cuda":
-            generators["cuda"] = torch.cuda.get_rng_state(self.device)
         return {name: part.state_dict() for name, part in self._parts().items()} | {
             "episodes": self._episode_num,
             "updates": self._n_updates,
@@ -435,9 +483,9 @@ class CFP(SAC):
                 "generators": env.torch_env.generators,
                 "returns": torch.from_numpy(monitor.episode_returns.copy()),
                 "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
-                "observation": torch.from_numpy(np.array(self._last_obs)),
+                "observation": torch.as_tensor(self._last_obs).cpu().clone(),
             },
-            "random": generators,
+            "random": {name: generator_state(generator) for name, generator in self._generators().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -457,12 +505,10 @@ class CFP(SAC):
         env.torch_env.generators = episodes["generators"]
         monitor.episode_returns = episodes["returns"].numpy().copy()
         monitor.episode_lengths = episodes["lengths"].numpy().copy()
-        self._last_obs = episodes["observation"].numpy().copy()
-        torch.set_rng_state(generators["torch"])
+        observation: Any = episodes["observation"].clone()
+        self._last_obs = observation.to(self.device) if self.on_device else observation.numpy()
         for name, generator in self._generators().items():
-            generator.bit_generator.state = generators[name]
-        if "cuda" in generators and self.device.type == "cuda":
-            torch.cuda.set_rng_state(generators["cuda"], self.device)
+            restore_generator(generator, generators.get(name, generators["torch"]))
 
     def _parts(self) -> dict[str, Any]:
         """What has a state of its own."""
@@ -477,10 +523,13 @@ class CFP(SAC):
         assert isinstance(monitor, VecMonitor) and isinstance(monitor.venv, TorchVecEnv)
         return monitor, monitor.venv
 
-    def _generators(self) -> dict[str, np.random.Generator]:
-        """Those that training draws from, beside torch's: the replay memory's, and the action space's."""
+    def _generators(self) -> dict[str, np.random.Generator | torch.Generator]:
+        """Those that training draws from: torch's, the replay memory's, and the action space's."""
         assert isinstance(self.replay_buffer, ReplayRing)
-        return {"replay": self.replay_buffer.generator, "actions": self.action_space.np_random}
+        own = {"replay": self.replay_buffer.generator, "actions": self.action_space.np_random}
+        if self.device.type == "cuda":
+            own["cuda"] = torch.cuda.default_generators[torch.empty(0, device=self.device).device.index]
+        return {"torch": torch.default_generator, **own}
 
 
 class SACLearner(CFP, Learner):
@@ -524,7 +573,8 @@ class SACLearner(CFP, Learner):
         return lines
 
     def log_row(self) -> None:
-        """Record scalars of the last episodes; those of the updates were recorded by `train`."""
+        """Record scalars of the updates and of the last episodes."""
+        self.read_updates()
         episodes, record = self.ep_info_buffer or (), self.logger.record
         for name, key in (("return", "r"), ("length", "l")):
             record(f"rollout/{name}", float(np.mean([float(each[key]) for each in episodes])) if episodes else None)
@@ -552,7 +602,8 @@ class CFPSAC(SACLearner, CoarseToFine):
     @classmethod
     def create(cls, config: SACConfig, stage: int, folder: Path) -> CFPSAC:
         """Networks, replay memory and environment of a stage."""
-        env = make_env(config, config.action_size(stage), max_episode_steps=config.max_episode_steps)
+        tensors = choose_device(config.device) != "cpu"
+        env = make_env(config, config.action_size(stage), None, config.max_episode_steps, tensors)
         learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": config.actor_spec(stage)})
         assert isinstance(learner, CFPSAC)
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.networks()[0])
@@ -562,5 +613,6 @@ class CFPSAC(SACLearner, CoarseToFine):
 
     def images(self) -> dict[str, np.ndarray]:
         """What the actor does with the observation of the first robot."""
-        observation = torch.as_tensor(np.asarray(self._last_obs)[:1], device=self.device)
+        seen: Any = self._last_obs
+        observation = torch.as_tensor(seen[:1], device=self.device)
         return policy_pictures(self.trained_actor, observation)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from dittogym.copies import to_device
 from dittogym.geometry import contains
 from dittogym.physics import real_tensor
 from dittogym.spec import BodySpec, TaskSpec
@@ -105,6 +106,8 @@ class InitialPositions:
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
+        if seed is None and given is None and len(self.positions) and not self.resample:
+            return self
         seeds, generators = self._seeds(seed), dict(self.generators)
         # Every element has positions from the first draw on.
         redrawn = mask.copy() if len(self.positions) else np.ones_like(mask)
@@ -123,12 +126,15 @@ class InitialPositions:
             for i in np.flatnonzero(redrawn).tolist():
                 drawn = [body_positions(body, n, generators[i], random=self.random) for body, n in bodies]
                 stacked[i] = np.concatenate(drawn)
-            positions = torch.from_numpy(stacked).to(like)
+            host = torch.from_numpy(stacked).to(like.dtype)
+            self._check_inside(host, np.flatnonzero(redrawn))
+            positions = to_device(host.numpy(), like.device)
         else:
             return self
         if len(self.positions):
-            positions = tree.where(torch.as_tensor(redrawn, device=like.device), positions, self.positions)
-        self._check_inside(positions)
+            positions = tree.where(to_device(redrawn, like.device), positions, self.positions)
+        if given is not None:
+            self._check_inside(positions, np.arange(self.num_envs))
         return replace(self, generators=generators, positions=positions)
 
     def _seeds(self, seed: Seed) -> Sequence[int | None]:
@@ -150,7 +156,8 @@ class InitialPositions:
             raise ValueError(f"positions must have shape {allowed}, got {tuple(positions.shape)}")
         return positions.expand(self.num_envs, *shape).contiguous()
 
-    def _check_inside(self, positions: Tensor) -> None:
+    def _check_inside(self, positions: Tensor, elements: np.ndarray) -> None:
+        positions = positions if len(elements) == self.num_envs else positions[torch.from_numpy(elements)]
         if not bool((finite := torch.isfinite(positions)).all()):
             raise ValueError(f"positions must be finite, got {positions[~finite][0].item()}")
         origin = self.spec.window.origin(positions[:, : self.counts[0]].mean(1))
@@ -158,7 +165,7 @@ class InitialPositions:
         if not bool(inside.all()):
             element, particle = (~inside).nonzero()[0].tolist()
             window = window_range(origin[element : element + 1])
-            where = f"{positions[element, particle].tolist()} for particle {particle} of element {element}"
+            where = f"{positions[element, particle].tolist()} for particle {particle} of element {elements[element]}"
             raise ValueError(f"positions must lie inside the window ({window}), got {where}")
 
 

@@ -3,6 +3,7 @@
 import math
 
 from dittogym.bodies.shapes import Disc, Rectangle
+from dittogym.copies import constant
 from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes, side_walls
 from dittogym.rewards import Reward, TaskState, Transition
 from dittogym.spec import BodySpec, TaskSpec
@@ -54,7 +55,7 @@ def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Distances of the cube from the goal, and of the hand from the cube."""
     x, cube = transition.robot_x, transition.object_com
     hand = transition.ops.mean_over_nearest(x, x, transition.task_state["object_com"], HAND)
-    to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - cube.new_tensor(spec.goal), hand - cube))
+    to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - constant(spec.goal, cube), hand - cube))
     return Reward(
         terms={
             "object_distance": -transition.ops.clamp(to_goal, high=CAP),

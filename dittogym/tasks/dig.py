@@ -1,6 +1,7 @@
 """DIG: get through loose soil to a point in it."""
 
 from dittogym.bodies.shapes import Disc, Rectangle
+from dittogym.copies import constant
 from dittogym.geometry import Window, ceiling, floor, side_walls
 from dittogym.rewards import Reward, Transition, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
@@ -19,7 +20,7 @@ SOIL = BodySpec(SOIL_PLACE, count=8000, lite=3400, material=SNOW, hidden_velocit
 def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Mean distance of all particles from the goal, under a square root; speed to the right and downwards."""
     x = transition.robot_x
-    distance = (x - x.new_tensor(spec.goal)).abs().sum(-1).mean(1)
+    distance = (x - constant(spec.goal, x)).abs().sum(-1).mean(1)
     right, up = transition.now.velocity.unbind(1)
     rightwards, downwards = (transition.ops.clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in (right, -up))
     return Reward(

@@ -1,6 +1,7 @@
 """GROW: reach a point above, past two beams."""
 
 from dittogym.bodies.shapes import Lattice
+from dittogym.copies import constant
 from dittogym.geometry import Obstacle, Window, ceiling, floor, nodes, side_walls
 from dittogym.rewards import Reward, TaskState, Transition, count_of, distance, drop_widest, pick
 from dittogym.spec import BodySpec, TaskSpec
@@ -49,7 +50,7 @@ def initial_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
 def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Mean distance of the tip from the goal, under a square root."""
     tip = pick(transition.particles.x, transition.task_state["tip"])
-    gap = distance(tip, tip.new_tensor([spec.goal])).mean(1)
+    gap = distance(tip, constant([spec.goal], tip)).mean(1)
     reached = gap < REACHED
     return Reward(
         terms={"distance": -gap.sqrt(), "success": transition.ops.heaviside(REACHED - gap, BONUS_WIDTH)},

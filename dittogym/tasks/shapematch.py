@@ -1,9 +1,8 @@
 """SHAPE MATCH: take the shape of a picture, without gravity."""
 
-import torch
-
 from dittogym.bodies.images import PictureLike
 from dittogym.bodies.shapes import Disc
+from dittogym.copies import constant
 from dittogym.geometry import ceiling, floor
 from dittogym.rewards import Reward, Transition
 from dittogym.spec import BodySpec, TaskSpec
@@ -15,10 +14,11 @@ MATCH = 0.8
 
 def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Number of pixels in which silhouette and target differ; in the smooth form the number to expect."""
-    target = torch.as_tensor(spec.target, device=transition.observation.device)
     silhouette = transition.ops.silhouette(transition.observation)
-    differing = (silhouette.to(transition.now.com) - target.to(transition.now.com)).abs().sum((1, 2))
+    numbers = silhouette.to(transition.now.com)
+    differing = (numbers - constant(spec.target, numbers)).abs().sum((1, 2))
     occupied = silhouette >= 0.5
+    target = constant(spec.target, occupied)
     iou = (occupied & target).sum((1, 2)) / (occupied | target).sum((1, 2))
     return Reward(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 

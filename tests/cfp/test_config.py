@@ -197,7 +197,7 @@ def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
     done = torch.ones(3, dtype=torch.bool)
     episodes = Episodes(env, 5, max_episode_steps=2, num_layouts=4)
     for _ in range(3):
-        episodes.restart(done, done, done)
+        episodes.restart(episodes.read(done, done, done))
     assert len(set(trained)) == 4 and min(trained) >= 5 and max(trained) < 5 + 8
     config = sac(seed=5, eval_episodes=7)
     assert config.evaluation(1) == config.evaluation(2) == (10_005, 7)

@@ -278,7 +278,7 @@ def compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str,
     """What NVRTC was asked for: architectures, and the precision."""
     asked: list[tuple[str, str]] = []
 
-    def compile_source(text: str, arch: str, macros: dict[str, str]) -> bytes:
+    def compile_source(text: str, arch: str, macros: dict[str, str], **_: object) -> bytes:
         asked.append((arch, macros["TORCHMPM_REAL"]))
         return f"binary {len(asked)}".encode()
 

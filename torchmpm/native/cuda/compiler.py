@@ -64,18 +64,25 @@ def compile_kernel(kernel: Kernel, arch: str) -> bytes:
         with suppress(OSError):
             return path.read_bytes()
         _logger.info("compiling %s for %s (once on this machine, some seconds)", kernel.name, arch)
-        binary = compile_source(source_of(kernel), arch, kernel.macros)
+        binary = compile_source(source_of(kernel), arch, kernel.macros, folder=path_of(kernel).parent)
         _keep(path, binary)
     return binary
 
 
 def source_of(kernel: Kernel) -> str:
     """The text of a kernel."""
-    return (FOLDERS[0] / kernel.source).read_text(encoding="utf-8")
+    return path_of(kernel).read_text(encoding="utf-8")
 
 
-def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.StringIO | None = None) -> bytes:
-    """The binary of a source that may include the headers of :data:`FOLDERS`; see :func:`compile_kernel`.
+def path_of(kernel: Kernel) -> Path:
+    """The file of a kernel; those of other packages have absolute paths."""
+    return FOLDERS[0] / kernel.source
+
+
+def compile_source(
+    text: str, arch: str, macros: Mapping[str, str], log: io.StringIO | None = None, folder: Path = FOLDERS[0]
+) -> bytes:
+    """The binary of a source that may include headers of :data:`FOLDERS` and its own; see :func:`compile_kernel`.
 
     With a ``log``, what the assembler says of registers and memory is written to it.
     """
@@ -84,7 +91,7 @@ def compile_source(text: str, arch: str, macros: Mapping[str, str], log: io.Stri
     options = ProgramOptions(
         arch=arch,
         std="c++17",
-        include_path=list(map(str, FOLDERS)),
+        include_path=list(map(str, dict.fromkeys((folder, *FOLDERS)))),
         define_macro=list(macros.items()) or None,
         ptxas_options="-v" if log else None,
         **_ROUNDING,

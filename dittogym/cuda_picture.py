@@ -1,0 +1,88 @@
+"""Launches the CUDA kernel of the observation, ``picture.cu``."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmpm.native.cuda.driver import Driver, Launch
+
+_SOURCE = Path(__file__).with_name("picture.cu")
+#: Threads of a block, the blocks that share an image, and the fine pixels of each.
+THREADS, BANDS, FINE_PIXELS = 256, 16, 32 * 512
+#: Four sums of whole numbers in each image pixel of a block.
+SUMS = 4 * 4 * 64
+
+
+class Arguments(ctypes.Structure):
+    """The only argument of the kernel, as ``struct Arguments`` in ``picture.cu``."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("batch", "particles", "pixels", "bodies", "boxes")),
+        *((name, ctypes.c_void_p) for name in ("body", "box")),
+        ("view", ctypes.c_double * 2),
+        *((name, ctypes.c_double) for name in ("margin", "extent", "clip", "saturation", "unit", "speed_unit")),
+        *((name, ctypes.c_void_p) for name in ("x", "v", "origin", "centre", "image")),
+    ]
+
+
+class Kernel(NamedTuple):
+    """What the kernel is compiled for, as :class:`torchmpm.native.cuda.arguments.Kernel` says it of those there."""
+
+    real: str  # "float" or "double"
+    threads: int
+    digest: str  # of its sources
+
+    @classmethod
+    def of(cls, dtype: torch.dtype) -> Kernel:
+        """That for positions in a dtype."""
+        return cls({torch.float32: "float", torch.float64: "double"}[dtype], THREADS, _digest())
+
+    @property
+    def source(self) -> str:
+        """Its file."""
+        return str(_SOURCE)
+
+    @property
+    def name(self) -> str:
+        """Its name in the compiled module."""
+        return "dittogym_draw"
+
+    @property
+    def macros(self) -> dict[str, str]:
+        """What the compiler must define."""
+        return {"TORCHMPM_REAL": self.real, "TORCHMPM_THREADS": str(self.threads)}
+
+
+@functools.cache
+def _digest() -> str:
+    return hashlib.sha256(_SOURCE.read_bytes() + _SOURCE.with_suffix(".hpp").read_bytes()).hexdigest()
+
+
+def draw(driver: Driver, kernel: Any, arrays: Mapping[str, Tensor], full: float, **constants: Any) -> None:
+    """Draw the images of a batch, on the current stream.
+
+    Args:
+        driver: Where the kernel runs.
+        kernel: The :class:`Kernel`.
+        arrays: The tensors of :class:`Arguments`, all contiguous.
+        full: Full-size particles of all bodies; sums in an image pixel are at most as large.
+        constants: All other members of :class:`Arguments`.
+    """
+    unit = 2.0 ** (math.ceil(math.log2(max(full, 1.0))) - 30)
+    _, batch, particles = arrays["x"].shape
+    pointers = {name: array.data_ptr() for name, array in arrays.items()}
+    speed_unit = unit * 2.0 ** math.ceil(math.log2(constants["clip"]))
+    sizes = {"batch": batch, "particles": particles, "unit": unit, "speed_unit": speed_unit}
+    arguments = Arguments(**pointers, **sizes, **constants)
+    launch = Launch(batch * BANDS, kernel.threads, 4 * (FINE_PIXELS if constants["pixels"] else SUMS))
+    device = arrays["x"].device
+    driver.launch(driver.load(kernel, device), launch, arguments, device)

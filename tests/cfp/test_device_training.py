@@ -1,0 +1,308 @@
+"""Training on a GPU, as far as a CPU can tell: observations, actions and transitions that stay on the device, updates
+that do not wait for it, the options of a GPU, and runs that change their device.
+"""
+
+import copy
+import json
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+from fakes import FakeEnv
+from stable_baselines3.common.logger import Logger
+from tiny_runs import resume, run
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from cfp import CFP, CFPPolicy, registry, train
+from cfp.agent.actor import ActorSpec, build_actor
+from cfp.analytic import window
+from cfp.analytic.critic import Critic, mlp
+from cfp.analytic.learner import ImageMemory, Regression
+from cfp.analytic.window import Window
+from cfp.config import Hyperparameters, WindowConfig, to_words
+from cfp.envs.vec_env import TorchVecEnv, monitored
+from cfp.errors import ConfigError, NonFiniteError
+from cfp.experiment.checkpoint import ReplayArchive
+from cfp.learner import generator_state, restore_generator
+from cfp.presets import GPU, analytic_preset, for_gpu, sac_preset
+from cfp.sac import learner, replay
+from cfp.tables import read_table
+
+SPEC = ActorSpec((4, 8), (-1.0,), patch=16, encoder="small")
+OPTIONS = {"buffer_size": 60, "batch_size": 8, "update_start": 6, "random_steps": 10, "n_steps": 3, "gamma": 0.9}
+FIELDS = replay.FIELDS
+
+
+def make_model(tensors=True, env=None, cls=CFP, **options):
+    env = env or FakeEnv(num_envs=3, resolution=16, horizon=7, end_above=0.2)
+    own = Hyperparameters(**OPTIONS | {"noise_cells": 2, "weight_average": 0.9} | options)
+    model = cls(CFPPolicy, monitored(env, 5, tensors), own, seed=0, device="cpu", policy_kwargs={"spec": SPEC})
+    model.set_logger(Logger(None, []))
+    return model
+
+
+class Waits(TorchDispatchMode):
+    """Notes the operators for which a GPU would have to be waited for: those that give the host a number or a size."""
+
+    NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero", "item")
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        indices = args[1] if name.startswith("index") and len(args) > 1 and isinstance(args[1], list | tuple) else ()
+        masked = any(isinstance(index, torch.Tensor) and index.dtype == torch.bool for index in indices)
+        if any(part in name for part in self.NAMES) or masked:
+            self.found.append(name)
+        return function(*args, **(kwargs or {}))
+
+
+@contextmanager
+def nothing_read(monkeypatch):
+    """Nothing is waited for, and no tensor becomes an array or a list, in this block."""
+    with monkeypatch.context() as patch, Waits() as waits:
+        for name in ("numpy", "tolist", "cpu", "__array__"):
+            patch.setattr(torch.Tensor, name, lambda *_, name=name: pytest.fail(f"Tensor.{name} waits for a GPU"))
+        yield
+    assert waits.found == []
+
+
+def test_an_update_of_soft_actor_critic_waits_for_nothing(monkeypatch):
+    model = make_model()
+    model.learn(30)
+    with nothing_read(monkeypatch):
+        model.train(3, 8)
+    with pytest.raises(pytest.fail.Exception, match="tolist"), nothing_read(monkeypatch):
+        model.read_updates()
+
+
+def test_updates_by_gradients_wait_for_nothing(monkeypatch):
+    actor, critic = build_actor(SPEC), mlp(5, 1)
+    actor.fix_std()
+    memory = ImageMemory(12, (torch.zeros(3, 64, 64, dtype=torch.uint8), torch.zeros(4, 8, 8)))
+    memory.add(torch.zeros(6, 3, 64, 64, dtype=torch.uint8), torch.zeros(6, 4, 8, 8))
+    regression, generator = Regression(actor, 1e-3, 0.9, 1.0), torch.Generator()
+    values = Critic(critic, WindowConfig(task="run", algo="shac", critic_updates=2))
+    for adam in (regression.adam, values.adam):
+        adam.param_groups[0]["fused"] = True  # as on a GPU; others count their steps on the host
+    seen = Window(torch.randn(4, 3, 5), torch.randn(4, 3), torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.bool), 0.0)
+    regression.update(*memory.sample(4, generator), 1e-3)
+    with nothing_read(monkeypatch):
+        for _ in range(3):
+            regression.update(*memory.sample(4, generator), 1e-3)
+    waits = Waits()
+    with waits:
+        values.update(seen, 1e-3)
+    assert len(waits.found) == 2  # whether the gradients were finite, and the loss to log, once a window
+
+
+def test_training_on_the_device_stores_and_returns_what_arrays_do():
+    """The same robots, whose random actions do not depend on where the transitions are."""
+    by_arrays, on_device = (make_model(tensors, random_steps=60, update_start=999) for tensors in (False, True))
+    for model in (by_arrays, on_device):
+        model.learn(60)  # twenty rows, as many as the ring has
+    assert isinstance(on_device._last_obs, torch.Tensor) and isinstance(on_device.replay_buffer.rewards, torch.Tensor)
+    assert by_arrays.replay_buffer.timeouts.any()
+    for name in (*FIELDS, "pos", "full"):
+        first, second = (np.asarray(getattr(model.replay_buffer, name)) for model in (by_arrays, on_device))
+        np.testing.assert_array_equal(first, second, err_msg=name)
+    assert [info["r"] for info in by_arrays.ep_info_buffer] == [info["r"] for info in on_device.ep_info_buffer]
+    assert list(by_arrays.ep_success_buffer) == list(on_device.ep_success_buffer)
+    numbers = np.random.default_rng(0).permutation(60)
+    for model, drawn in ((by_arrays, numbers), (on_device, torch.from_numpy(numbers))):
+        model.replay_buffer._draw = lambda size, drawn=drawn: drawn[:size]
+    one, other = (model.replay_buffer.sample(40) for model in (by_arrays, on_device))
+    assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
+
+
+def test_observations_and_actions_may_be_tensors():
+    venv, other = (TorchVecEnv(FakeEnv(num_envs=3, horizon=2), tensors=tensors) for tensors in (True, False))
+    actions, seen = np.full((3, 2, 8, 8), 0.5, np.float32), [venv.reset()]
+    assert np.array_equal(seen[0].numpy(), other.reset())
+    for given in (actions, torch.from_numpy(actions)):
+        observation, *results = venv.step(given)
+        expected, *others = other.step(actions)
+        assert np.array_equal(observation.numpy(), expected)
+        assert all(np.array_equal(*pair) for pair in zip(results[:2], others[:2], strict=True))
+        seen.append(observation)
+    assert len({image.data_ptr() for image in seen}) == 3 and others[1].all()  # nothing is overwritten
+    for info, usual in zip(results[2], others[2], strict=True):
+        final = info.pop("terminal_observation"), usual.pop("terminal_observation")
+        assert info == usual and np.array_equal(*final)
+
+
+def test_what_is_not_finite_ends_the_training_before_anything_is_saved():
+    model = make_model()
+    model.learn(30)
+    model.read_updates()
+    next(model.networks()[1].parameters()).register_hook(lambda gradient: gradient * float("inf"))
+    model.train(2, 8)
+    with pytest.raises(NonFiniteError, match="a loss or its gradient is not finite in one of the updates"):
+        model.state_dict()
+    diverged = make_model(update_start=999, random_steps=0)
+    with torch.no_grad():
+        diverged.networks()[0].trainable_parameters()[-1].fill_(torch.nan)
+    with pytest.raises(NonFiniteError, match="the policy has diverged"):
+        diverged.learn(3)
+    assert diverged.replay_buffer.size() == 0
+
+
+def test_rows_hold_the_means_of_all_updates():
+    rows = []
+    for tensors in (False, True):
+        model = make_model(tensors, random_steps=99)
+        model.learn(30, log_interval=None)
+        model.read_updates()
+        rows.append((dict(model.logger.name_to_count), set(model.logger.name_to_value)))
+    assert rows[0] == rows[1] and rows[0][0]["train/critic_loss"] == model._n_updates > 5
+
+
+def test_memory_that_does_not_fit_on_a_gpu_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10_000_000_000, 0))
+    replay.check_room(280_000, 25_000, torch.device("cuda"))
+    with pytest.raises(
+        ConfigError, match=r"buffer_size must be at most 280,000 on this GPU, of which 10.0 GB are free"
+    ):
+        replay.check_room(1_000_000, 25_000, torch.device("cuda"))
+
+
+def test_windows_that_do_not_fit_on_a_gpu_are_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10_000_000_000, 0))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 1_000_000_000)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 1_000_000_000)
+    env = FakeEnv(num_envs=64)
+    window.check_gradient_memory(env, 16, 500_000_000)
+    with pytest.raises(ConfigError, match="num_envs must be at most 35 with window 16 on this GPU, got 64"):
+        window.check_gradient_memory(env, 16, 1_000_000_000)
+
+
+# Options.
+
+
+@pytest.mark.parametrize("make", [sac_preset, analytic_preset])
+@pytest.mark.parametrize("task", ["run", "shapematch", "slot"])
+def test_a_gpu_has_as_many_batched_steps_of_more_robots(make, task):
+    config = make(task)
+    gpu = for_gpu(config)
+    gpu.check()
+    assert {name: getattr(gpu, name) for name in GPU[config.algo]} == GPU[config.algo]
+    assert gpu.steps / gpu.num_envs == config.steps / config.num_envs
+    assert gpu.handover == config.handover and gpu.ends()[0] / gpu.steps == config.ends()[0] / config.steps
+    if make is sac_preset:
+        assert for_gpu(config, 24_000_000_000).buffer_size == 320_000
+        assert for_gpu(sac_preset(task, "paper")) == sac_preset(task, "paper")
+
+
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+def test_a_command_line_takes_the_options_of_a_gpu_and_the_user_wins(learner, capsys):
+    def options(*words):
+        assert train.main(["--task", "run", "--learner", learner, *words, "--dry-run"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    usual, gpu = options("--device", "cpu"), options("--device=cuda")
+    own = for_gpu(registry.find(usual["algo"]).preset("run", "quick"))
+    assert gpu == json.loads(json.dumps(asdict(replace(own, device="cuda")))) != usual
+    assert options("--device", "cuda", "--num-envs", "64") == gpu | {"num_envs": 64}
+    stated = {name: usual[name] for name in usual if usual[name] != gpu[name] and name != "device"}
+    assert options("--device", "cuda", *to_words(stated)) == usual | {"device": "cuda"}
+    with pytest.raises(SystemExit):
+        train.main(["--task", "run", "--learner", learner, "--device", "cuda", "--help"])
+    assert "(default: 1024)" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+# Runs that change their device.
+
+
+def philox():
+    """A state as a generator on a GPU has it."""
+    return torch.arange(16, dtype=torch.uint8)
+
+
+def test_a_generator_goes_on_from_one_of_another_kind():
+    for generator in (torch.Generator(), np.random.default_rng(0)):
+        drawn = []
+        for state in (philox(), philox(), philox() + 1):
+            restore_generator(generator, state)
+            drawn.append(str(generator_state(generator)))
+        assert drawn[0] == drawn[1] != drawn[2]
+    seeded = torch.Generator()
+    restore_generator(seeded, np.random.default_rng(0).bit_generator.state)
+    assert seeded.initial_seed() != torch.Generator().initial_seed()
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+def test_a_run_of_a_gpu_goes_on_on_a_cpu(learner, tmp_path, monkeypatch):
+    """Its checkpoint differs from one of a CPU in the states of generators and the name of the device."""
+    folder, half = tmp_path / "run", "60" if learner == "sac" else "32"
+    one_stage = ["--resolutions", "4", "--handover", *(["--random-steps", "10"] if learner == "sac" else [])]
+    assert run(folder, *one_stage, "--steps", half, learner=learner) == 0
+    path = folder / "checkpoint" / "state.pt"
+    state = torch.load(path, weights_only=True)
+    if learner == "sac":
+        state["learner"]["random"] |= {"replay": philox(), "cuda": philox()}
+    else:
+        state["learner"]["generator"] = philox()
+    config = json.loads(state["config"]) | {"device": "cuda"}
+    torch.save(state | {"config": json.dumps(config)}, path)
+    (folder / "config.json").write_text(json.dumps(config))
+    assert resume(folder, "--device", "cpu", "--steps", "96") == 0
+    assert json.loads((folder / "config.json").read_text())["num_envs"] == 2
+    assert int(read_table(folder / "progress.csv")[-1]["step"]) >= 96
+
+
+def test_a_run_on_the_device_goes_on_to_the_last_bit_there_and_from_arrays(tmp_path):
+    saved = {}
+    for tensors in (True, False):
+        model = make_model(tensors)
+        model.learn(30)
+        archive = ReplayArchive(tmp_path / str(tensors), 1)
+        saved[tensors] = model, copy.deepcopy(model.state_dict()), archive.save(model.replay_buffer, 10)
+    for tensors, source in ((True, True), (True, False), (False, True)):
+        model, state, chunks = saved[source]
+        other = make_model(tensors)
+        other.env.reset()
+        ReplayArchive(tmp_path / str(source), 1).load(other.replay_buffer, 10, chunks)
+        other.load_state_dict(copy.deepcopy(state))  # as a file would
+        other.num_timesteps = 30
+        for name in FIELDS:
+            first, second = (np.asarray(getattr(each.replay_buffer, name)) for each in (model, other))
+            np.testing.assert_array_equal(first, second, err_msg=name)
+        torch.manual_seed(1)
+        other.learn(30, reset_num_timesteps=False)
+        assert all(torch.isfinite(value).all() for value in other.networks()[0].state_dict().values())
+        if tensors is source is True:
+            again = other.networks()[0].state_dict()
+    torch.manual_seed(1)
+    saved[True][0].learn(30, reset_num_timesteps=False)
+    whole = saved[True][0].networks()[0].state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in whole.items())
+
+
+@pytest.mark.usefixtures("short")
+def test_both_stages_of_a_run_train_on_the_device_and_go_on(tmp_path, monkeypatch):
+    make = learner.make_env
+    monkeypatch.setattr(learner, "make_env", lambda *options: make(*options[:-1], True))
+    assert run(tmp_path / "run", "--steps", "100", "--handover", "0.5") == 0
+    assert resume(tmp_path / "run", "--steps", "120") == 0
+    rows = read_table(tmp_path / "run" / "progress.csv")
+    assert {row["stage"] for row in rows} == {"1", "2"} and rows[-1]["step"] == "120"
+    assert all(np.isfinite(float(row["train/critic_loss"])) for row in rows[3:])
+    state = torch.load(tmp_path / "run" / "checkpoint" / "state.pt", weights_only=True)
+    assert isinstance(state["learner"]["random"]["replay"], torch.Tensor)
+
+
+def test_chunks_are_written_by_several_threads(tmp_path, monkeypatch):
+    monkeypatch.setattr("cfp.experiment.checkpoint.LARGEST_CHUNK", 9)
+    model, other = make_model(), make_model()
+    model.learn(60)
+    archive = ReplayArchive(tmp_path, 1)
+    chunks = archive.save(model.replay_buffer, 20)
+    assert [chunk["stop"] - chunk["start"] for chunk in chunks] == [3] * 6 + [2]
+    ReplayArchive(tmp_path, 1).load(other.replay_buffer, 20, chunks)
+    for name in FIELDS:
+        assert torch.equal(getattr(model.replay_buffer, name), getattr(other.replay_buffer, name))

@@ -1,0 +1,160 @@
+"""The CUDA kernel of the observation, on the imitation of a GPU that the tests of the physics have."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_native_picture import drawn_as
+from tiny import TASKS, actions, set_particles, tiny
+from torch import Tensor
+
+import dittogym
+from dittogym import cuda_picture
+from dittogym.observation import cuda_drawing
+from torchmpm.backends import compiler_found
+from torchmpm.native.cuda import compiler
+from torchmpm.native.cuda.compiler import FOLDERS
+from torchmpm.native.cuda.driver import Launch
+from torchmpm.native.library import build
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+HERE = Path(__file__).resolve().parent
+IMITATION = HERE.parent / "torchmpm" / "imitation"
+CPU = torch.device("cpu")
+THREADS = 32
+
+
+@functools.cache
+def library(kernel: cuda_picture.Kernel) -> ctypes.CDLL:
+    folders = (*FOLDERS, IMITATION, Path(dittogym.__file__).parent)
+    digest = hashlib.sha256(kernel.digest.encode())
+    for file in sorted(file for folder in (FOLDERS[0], IMITATION) for file in folder.glob("*.[ch]*")):
+        digest.update(file.read_bytes())
+    named = kernel.macros | {"TORCHMPM_THREADS": str(THREADS), "DIGEST": digest.hexdigest()[:16]}
+    options = [*(f"-D{name}={value}" for name, value in named.items()), *(f"-I{folder}" for folder in folders)]
+    return build(HERE / "picture_imitation.cpp", "-O1", *options)
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """A driver whose device is the CPU, with blocks of few threads, and what is broken about it."""
+
+    seed: int = 0  # of the order of threads
+    barrier: int = -1  # the one that is missing, and the operation that is not atomic, in the order of picture.cu
+    atomic: int = -1
+
+    def load(self, kernel: cuda_picture.Kernel, device: torch.device) -> ctypes.CDLL:
+        return library(kernel)
+
+    def launch(self, function: Any, launch: Launch, arguments: ctypes.Structure, device: torch.device) -> None:
+        assert launch.shared_bytes <= 99 * 1024, "more than a block of an RTX 4090 has"
+        missing = -1 if self.barrier < 0 else function.barriers() + self.barrier
+        plain = -1 if self.atomic < 0 else function.atomics() + self.atomic
+        size = ctypes.c_size_t(launch.shared_bytes), ctypes.c_uint64(self.seed)
+        outcome = function.launch(ctypes.byref(arguments), launch.blocks, *size, missing, plain)
+        assert outcome == 0, f"the launch ended with {outcome}"
+
+
+def draw(env: dittogym.TorchEnv, gpu: Gpu | None = None) -> Tensor:
+    """The present observation by the kernel."""
+    state = env.env_state
+    arrays = state.particles.x, state.particles.v, state.origin, state.centre
+    return cuda_drawing(env.model.camera, env.dtype, CPU, gpu or Gpu())(*arrays)
+
+
+def scene(task: str, pixels: bool, dtype: str = "float32", num_envs: int = 2) -> dittogym.TorchEnv:
+    """Robots in motion, and particles anywhere."""
+    env = drawn_as(tiny(task, num_envs, dtype=dtype), pixels)
+    env.reset(seed=2)
+    with torch.no_grad():
+        env.step(actions(env, 1)[0])
+    generator = torch.Generator().manual_seed(0)
+    x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
+    set_particles(env, x=x, v=4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
+    return env
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_equals_torch(task: str, pixels: bool) -> None:
+    """Sums are rounded elsewhere: in one of a thousand pixels a byte may be one off."""
+    for dtype in ("float32", "float64") if task in ("run", "dig") else ("float32",):
+        env = scene(task, pixels, dtype)
+        state = env.env_state
+        plain = env.model.camera.draw(state.particles.x, state.particles.v, state.origin, state.centre)
+        difference = (draw(env).int() - plain.int()).abs()
+        assert len(plain.unique()) > 20 and difference.max() <= 1
+        assert (difference > 0).double().mean() <= 1e-3
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+def test_what_is_not_drawn(pixels: bool) -> None:
+    """Particles that are not finite, or anywhere else in the world; a robot that is nowhere harms no other."""
+    env = scene("kick", pixels, "float64", num_envs=3)
+    x, v = env.state.x.clone(), env.state.v.clone()
+    x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
+    x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
+    x[1, 5:10, 1] += 0.9
+    set_particles(env, x=x, v=v)
+    state = env.env_state
+    state.centre[2] = math.nan
+    plain = env.model.camera.draw(state.particles.x, state.particles.v, state.origin, state.centre)
+    assert (draw(env)[:2].int() - plain[:2].int()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+def test_order_of_threads_makes_no_difference(pixels: bool) -> None:
+    env = scene("dig", pixels)
+    first = draw(env)
+    for seed in range(1, 4):
+        assert torch.equal(draw(env, Gpu(seed)), first)
+
+
+@pytest.mark.parametrize(
+    "pixels, broken",
+    [
+        *((pixels, {"barrier": barrier}) for pixels in (False, True) for barrier in (0, 1)),
+        *((False, {"atomic": 0}), (True, {"atomic": 1})),
+    ],
+)
+def test_barriers_and_atomic_operations_are_needed(pixels: bool, broken: dict[str, int]) -> None:
+    """Without one of them, some order of the threads draws something else."""
+    env = scene("dig", pixels)
+    expected = draw(env)
+
+    def noticed(seed: int) -> bool:
+        try:
+            return not torch.equal(draw(env, Gpu(seed, **broken)), expected)
+        except ValueError:  # already when it was tried against torch
+            return True
+
+    assert any(map(noticed, range(20)))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["sm_80", "sm_89", "sm_90", "sm_120"])
+def test_it_compiles(arch: str) -> None:
+    kernel = cuda_picture.Kernel.of(torch.float32)
+    folder = compiler.path_of(kernel).parent
+    binary = compiler.compile_source(compiler.source_of(kernel), arch, kernel.macros, folder=folder)
+    assert binary.startswith(b"\x7fELF")
+
+
+def test_a_kernel_that_draws_something_else_is_not_used() -> None:
+    class Idle(Gpu):
+        def launch(self, function: Any, launch: Launch, arguments: ctypes.Structure, device: torch.device) -> None:
+            ctypes.memset(arguments.image, 0, 12288 * arguments.batch)
+
+    camera = tiny("run").model.camera
+    with pytest.raises(ValueError, match="a pixel differed by"):
+        cuda_drawing(camera, torch.float32, CPU, Idle())

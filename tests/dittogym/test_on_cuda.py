@@ -1,0 +1,91 @@
+"""Environment steps on a GPU: recorded ones against others, where they wait, and streams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from tiny import TASKS, actions, tiny
+
+import dittogym
+from dittogym.cuda_graph import WARM_UP
+from torchmpm import tree
+
+pytestmark = pytest.mark.cuda
+
+
+@contextmanager
+def without_waiting() -> Iterator[None]:
+    """An error where the host waits for the device."""
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def on_cuda(task: str, **options: object) -> dittogym.TorchEnv:
+    env = tiny(task, 3, particles=600, dtype="float32", device="cuda", **options)
+    env.reset(seed=0)
+    return env
+
+
+def equal(ours: object, theirs: object) -> bool:
+    pairs = zip(tree.leaves(ours), tree.leaves(theirs), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_a_recorded_step_is_the_same(task: str) -> None:
+    ours, theirs = on_cuda(task), on_cuda(task)
+    theirs._replayed = None
+    mask = np.array([False, True, False])
+    for given in actions(ours, WARM_UP + 4).to("cuda"):
+        assert equal(ours.step(given), theirs.step(given)) and equal(ours.env_state, theirs.env_state)
+        assert equal(ours.reset(options={"reset_mask": mask}), theirs.reset(options={"reset_mask": mask}))
+    assert ours._replayed is not None and ours._replayed.failure is None
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_a_step_waits_for_nothing(task: str, gradients: bool, soft: bool) -> None:
+    env = on_cuda(task)
+    given = actions(env, 1)[0].to("cuda").requires_grad_(gradients)
+    with torch.set_grad_enabled(gradients):
+        for _ in range(WARM_UP + 2):
+            env.step(given, soft=soft)
+            env.detach()
+        with without_waiting():
+            env.step(given, soft=soft)
+
+
+@torch.no_grad()
+def test_another_stream() -> None:
+    ours, theirs = on_cuda("run"), on_cuda("run")
+    theirs._replayed = None
+    streams = torch.cuda.current_stream(), torch.cuda.Stream()
+    for k, given in enumerate(actions(ours, WARM_UP + 8).to("cuda")):
+        stream, before = streams[k % 2], streams[(k + 1) % 2]
+        stream.wait_stream(before)
+        with torch.cuda.stream(stream):
+            step = ours.step(given)
+        torch.cuda.synchronize()
+        assert equal(step, theirs.step(given))
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("particles", ["lite", "full"])
+@torch.no_grad()
+def test_the_kernel_draws_what_torch_does(task: str, particles: str) -> None:
+    env = dittogym.TorchEnv(task, 2, particles=particles, device="cuda")
+    env.reset(seed=0)
+    env.step(torch.ones(2, *env.action_shape, device="cuda"))
+    state, camera = env.env_state, env.model.camera
+    arrays = state.particles.x, state.particles.v, state.origin, state.centre
+    difference = (camera.observe(*arrays).int() - camera.draw(*arrays).int()).abs()
+    assert difference.max() <= 1 and (difference > 0).double().mean() <= 1e-3
