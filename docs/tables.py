@@ -26,7 +26,7 @@ from torchmpm import Snow
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 OBSERVES = ("image", "state", "simulator", "nothing")
-BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -->)")
+BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:.*\n)*?(<!-- end of table -->)")
 INF = math.inf
 #: Where algorithms say what they log.
 METRICS = {
@@ -232,15 +232,19 @@ def costs() -> str:
     return markdown(("task", "particles", *columns[1:]), lines)
 
 
-def gpu_run() -> dict[str, Any]:
-    """The last results of `make gpu`: the card, the date, and the rows of the stage `speed` by their names."""
+#: In place of speeds on a GPU until there are results.
+NO_CARD = "No card has run `make gpu` yet.\n"
+
+
+def gpu_run() -> tuple[str, dict[str, Any]] | None:
+    """The last results of `make gpu`: the card with the date, and the rows of the stage `speed` by their names."""
     files = (ROOT / "benchmarks/gpu").glob("*.json")
     found = max((json.loads(path.read_text()) for path in files), key=lambda result: result["date"], default=None)
     if found is None:
-        return {"card": "no card has run `make gpu` yet", "speed": {}}
+        return None
     card = next(row["figures"]["card"] for row in found["rows"] if row["check"] == "versions")
     speed = {row["check"]: row for row in found["rows"] if row["stage"] == "speed" and not row["wrong"]}
-    return {"card": f"{card}, {found['date']}", "speed": speed}
+    return f"{card}, {found['date']}", speed
 
 
 def rate(row: dict[str, Any] | None, name: str) -> str:
@@ -250,22 +254,26 @@ def rate(row: dict[str, Any] | None, name: str) -> str:
 
 def gpu() -> str:
     """Environment steps a second on the card that ran `make gpu` last."""
-    run, columns = gpu_run(), ("physics", "physics with gradient", "env.step", "env.step with gradient")
+    if (run := gpu_run()) is None:
+        return NO_CARD
+    (card, speed), columns = run, ("physics", "physics with gradient", "env.step", "env.step with gradient")
     rows = [
         [f"{name} ({row['backend']})", *(rate(row, column) for column in columns)]
-        for name, row in run["speed"].items()
+        for name, row in speed.items()
         if "physics (steps/s)" in row["figures"]
     ]
-    return markdown(("Robots × particles", *columns), rows or [[run["card"], *[""] * len(columns)]])
+    return markdown((f"Robots × particles ({card})", *columns), rows)
 
 
 def gpu_line() -> str:
     """The same in a line."""
-    run = gpu_run()
-    one, many = (run["speed"].get(name) for name in ("1 × full", "1024 × lite"))
+    if (run := gpu_run()) is None:
+        return NO_CARD
+    card, speed = run
+    one, many = (speed.get(name) for name in ("1 × full", "1024 × lite"))
     cells = [rate(one, "env.step"), rate(many, "env.step"), rate(many, "env.step with gradient")]
     columns = ("RUN, steps/s", "1 robot, 22,000 particles", "1,024 robots of 2,000", "1,024 with gradients")
-    return markdown(columns, [[run["card"], *cells]])
+    return markdown(columns, [[card, *cells]])
 
 
 def cuda_kernels() -> str:
