@@ -60,7 +60,7 @@ $(CUDA_STAMP): $(STAMP)
 
 cuda-kernels: $(CUDA_STAMP)  ## compile the CUDA kernels for all cards, and run all of their tests; needs no GPU
 	$(BIN)/python benchmarks/cuda_kernels.py
-	$(BIN)/python $(PYTEST) -m "" tests/torchmpm/test_cuda_*.py
+	$(BIN)/python $(PYTEST) -m "" tests/*/test_cuda_*.py
 
 # What of PyTorch and CUDA is installed outside is seen inside, and not installed again. Without a network, WHEELS names a
 # folder with wheels of the packages that are missing, and of setuptools.

@@ -59,7 +59,7 @@ class Kernel(NamedTuple):
     @property
     def macros(self) -> dict[str, str]:
         """What the compiler must define."""
-        return {"TORCHMPM_REAL": self.real, "TORCHMPM_THREADS": str(self.threads)}
+        return {"TORCHMPM_REAL": self.real, "TORCHMPM_THREADS": str(self.threads), "TORCHMPM_SHARED": "1"}
 
 
 @functools.cache

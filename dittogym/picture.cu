@@ -151,7 +151,7 @@ struct Band {
 
 }  // namespace
 
-KERNEL void dittogym_draw(const GRID_CONSTANT Arguments given) {
+KERNEL(1) void dittogym_draw(const GRID_CONSTANT Arguments given) {
     const int64_t element = BLOCK / BANDS;
     const Band band{given, element, BLOCK % BANDS * ROWS,
                     raster::Crop<Real>::around(given.view, given.origin + 2 * element, given.centre + 2 * element),
