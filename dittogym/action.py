@@ -88,5 +88,5 @@ def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
 @cached_tensors
 def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
     """Indices (P * P,) among all nodes of a patch in the corner of the window."""
-    along = torch.arange(patch, device=device)
-    return (along[:, None] * nodes + along).flatten()
+    along = torch.arange(patch, device="cpu")  # a copy to the device is there for all of its streams
+    return (along[:, None] * nodes + along).flatten().to(device)

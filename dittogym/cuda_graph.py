@@ -50,7 +50,8 @@ class CudaGraph:
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream()
             try:
-                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                own = torch.cuda.Stream(self._device)  # by default torch has one for all devices
+                with torch.cuda.graph(self._graph, stream=own, capture_error_mode="thread_local"):
                     return function()
             finally:
                 torch.cuda.set_stream(stream)  # torch stays on its own where the recording fails

@@ -6,6 +6,7 @@ import hashlib
 import os
 import struct
 import subprocess
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ HERE = Path(__file__).with_name("imitation")
 THREADS, PER_THREAD = 32, 4
 #: Bytes beyond the scratch memory that must stay as they are.
 MARGIN = 4096
+#: The imitation runs one launch at a time, while programs may launch from several threads.
+_one_machine = threading.Lock()
 
 
 class Broken(Exception):
@@ -66,10 +69,11 @@ class Gpu:
         if arguments.result and (kernel.shared or not arguments.status):
             numbers = COMPONENTS * arguments.batch * arguments.particles
             ctypes.memset(arguments.result, 0xFF, numbers * kernel.real_bytes)  # NaN where nothing is written
-        outcome = kernels.launch(
-            ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
-            ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
-        )  # fmt: skip
+        with _one_machine:
+            outcome = kernels.launch(
+                ctypes.byref(arguments), kernel.adjoint, launch.blocks, ctypes.c_size_t(launch.shared_bytes),
+                ctypes.c_uint64(self.seed), self.missing_barrier, self.plain_atomic,
+            )  # fmt: skip
         if outcome:
             raise Broken(("threads diverged", "threads wait for ever", "shared memory is too small")[outcome - 1])
         if scratch.raw[size:] != b"\xcb" * MARGIN:

@@ -86,17 +86,17 @@ def compile_source(
 
     With a ``log``, what the assembler says of registers and memory is written to it.
     """
-    from cuda.core import Program, ProgramOptions
-
-    options = ProgramOptions(
-        arch=arch,
-        std="c++17",
-        include_path=list(map(str, dict.fromkeys((folder, *FOLDERS)))),
-        define_macro=list(macros.items()) or None,
-        ptxas_options="-v" if log else None,
-        **_ROUNDING,
-    )
     try:
+        from cuda.core import Program, ProgramOptions
+
+        options = ProgramOptions(
+            arch=arch,
+            std="c++17",
+            include_path=list(map(str, dict.fromkeys((folder, *FOLDERS)))),
+            define_macro=list(macros.items()) or None,
+            ptxas_options="-v" if log else None,
+            **_ROUNDING,
+        )
         return bytes(Program(text, "c++", options).compile("cubin", logs=log).code)
     except Exception as error:  # of cuda.core, whose own type has no public name, or NVRTC is not found
         raise ValueError(f"its CUDA kernels cannot be compiled for {arch}: {str(error)[:4000]}") from error
