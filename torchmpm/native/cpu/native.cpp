@@ -1,4 +1,4 @@
-// The C interface that torchmpm/native/cpu/call.py calls.
+// The C interface that torchmpm/native/kernels.py calls.
 #include <exception>
 #include <memory>
 

@@ -1,4 +1,4 @@
-// The arguments of a call, as torchmpm/native/cpu/call.py lays them out, and what the kernels derive from them.
+// The arguments of a call, as torchmpm/native/kernels.py lays them out, and what the kernels derive from them.
 #pragma once
 #include <algorithm>
 #include <vector>
