@@ -15,7 +15,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 import dittogym.tasks
 from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
 from cfp.errors import ConfigError, brief, check_at_least, check_decay, check_fraction, check_positive
-from dittogym import make_spec
+from dittogym import Conditions, make_spec
 from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
 from dittogym.tasks import task_name
@@ -269,7 +269,60 @@ class StagedConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoarseToFineConfig(StagedConfig):
+class VariationConfig(StagedConfig):
+    """Conditions that differ between training episodes (domain randomisation; Tobin et al., IROS 2017).
+
+    Evaluations take place under the task's own conditions.
+    """
+
+    vary: float = 0.0
+    """Probability with which each condition of a training episode is drawn from its range; 0: all are the task's."""
+    vary_latency: int = 2
+    """Control steps by which actions come late, at most."""
+    vary_noise: float = 0.2
+    """Standard deviation of normal noise on actions, at most."""
+    vary_actions: float = 0.2
+    """Share of the entries of an action that are missing in every step, at most."""
+    vary_pixels: float = 0.2
+    """Share of the entries of an image that are missing in every step, at most."""
+    vary_physics: float = 0.2
+    """Relative change of mu, yield stress and gravity, at most."""
+    vary_start: float = 1.0
+    """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
+
+    def conditions(self, stage: int) -> Conditions | None:
+        """Those of training episodes."""
+        if not self.vary:
+            return None
+        factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
+        return Conditions(
+            latency=(min(1, self.vary_latency), self.vary_latency),
+            action_noise=(0.0, self.vary_noise),
+            action_dropout=(0.0, self.vary_actions),
+            observation_dropout=(0.0, self.vary_pixels),
+            mu=factors,
+            yield_stress=factors,
+            gravity=factors,
+            shift=0.01 * self.vary_start,
+            turn=5.0 * self.vary_start,
+            velocity=0.05 * self.vary_start,
+            chance=self.vary,
+            grid=self.resolution(stage),
+        )
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
+        for name in ("vary", "vary_actions", "vary_pixels", "vary_physics"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.vary_physics == 1:
+            raise ConfigError("vary_physics must be below 1, got 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseToFineConfig(VariationConfig):
     """A run of the coarse-to-fine policy, which may begin with a trained one."""
 
     start_from: str | None = None

@@ -4,6 +4,7 @@ Importing this package registers the Gymnasium ids ``dittogym/{task}-{coarse|fin
 task.
 """
 
+from dittogym.conditions import Conditions
 from dittogym.env import Env
 from dittogym.registration import register
 from dittogym.rewards import Reward, Transition
@@ -15,4 +16,15 @@ from dittogym.vector import BatchEnv
 for _task, _make in list(TASKS.items()):
     register(_task, _make)
 
-__all__ = ["TASKS", "BatchEnv", "Env", "Reward", "TaskSpec", "TorchEnv", "Transition", "make_spec", "register"]
+__all__ = [
+    "TASKS",
+    "BatchEnv",
+    "Conditions",
+    "Env",
+    "Reward",
+    "TaskSpec",
+    "TorchEnv",
+    "Transition",
+    "make_spec",
+    "register",
+]

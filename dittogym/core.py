@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dittogym.action import patch_field, place
+from dittogym.conditions import Drawn
 from dittogym.copies import constant
 from dittogym.geometry import GRID, centre_in_window, contains
 from dittogym.observation import Camera
@@ -44,6 +45,7 @@ class EnvState:
         task_state: What the task remembers.
         physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
         steps: (B,) int64 control steps taken.
+        conditions: Of these episodes, see :class:`dittogym.Conditions`; empty without.
     """
 
     particles: ParticleState
@@ -53,6 +55,7 @@ class EnvState:
     task_state: TaskState
     physics: Physics
     steps: Tensor
+    conditions: Drawn = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, for pickles and deep copies, which cannot hold an autograd graph."""
@@ -168,14 +171,17 @@ class StepResult(NamedTuple):
     soft_observation: Tensor | None = None
 
 
-def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tuple[EnvState, Tensor]:
-    """Start episodes with particles at rest.
+def reset(
+    model: Model, positions: Tensor, physics: Physics | None = None, velocity: Tensor | None = None
+) -> tuple[EnvState, Tensor]:
+    """Start episodes.
 
     Args:
         model: The task.
         positions: (B, N, 2) in the world, m, robot first.
         physics: Constants that differ from the task's, as :func:`dittogym.physics.physics_values` returns them. Whether
             they are stable is not checked.
+        velocity: (B, 2) of all of the robot, m/s; all particles are at rest if not given.
 
     Returns:
         State and observation (B, 3, 64, 64) uint8.
@@ -191,6 +197,9 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     if unknown := [name for name in physics or () if name not in NAMES]:
         raise ValueError(f"physics may hold {', '.join(NAMES)}, got {', '.join(unknown)}")
     spec, particles = model.spec, ParticleState.at_rest(positions)
+    if velocity is not None:
+        moving = torch.arange(shape[0], device=positions.device) < model.num_robot_particles
+        particles = replace(particles, v=moving[:, None] * velocity[:, None])
     start = features_of(particles, model.num_robot_particles)
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
     state = EnvState(particles, spec.window.origin(start.com), start.com, start, {}, physics or {}, steps)

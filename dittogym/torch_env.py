@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dittogym import conditions as varied
 from dittogym import core
 from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
+from dittogym.conditions import Conditions, Drawn, as_conditions
 from dittogym.copies import to_device
 from dittogym.core import EnvState, make_model
 from dittogym.cuda_graph import Replayed
@@ -60,6 +62,8 @@ class TorchEnv:
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Refuse what does not repeat bit by bit: CUDA.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
+        conditions: From which ranges each episode draws its start, the constants of its matter and its disturbances;
+            ``None``: all are the task's own.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
@@ -98,6 +102,7 @@ class TorchEnv:
         resample: bool = False,
         deterministic: bool = False,
         segment: Segment = "auto",
+        conditions: Conditions | Mapping[str, Any] | None = None,
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
@@ -124,6 +129,7 @@ class TorchEnv:
         core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
+        self.conditions = as_conditions(conditions)
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
         self._actuation: Tensor | None = None
@@ -161,9 +167,12 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
+        if self.conditions is not None and not value.conditions:
+            raise ValueError("env_state must have conditions, as this environment has them, got none")
         if self._env_state is not None and (missing := self._env_state.task_state.keys() - value.task_state.keys()):
             raise ValueError(f"env_state must have the task state of this task, got none of {sorted(missing)}")
-        self._env_state, self._actuation, self._observation = value, None, None
+        own_conditions = {} if self.conditions is None else value.conditions
+        self._env_state, self._actuation, self._observation = replace(value, conditions=own_conditions), None, None
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
@@ -186,8 +195,14 @@ class TorchEnv:
     def observation(self) -> Tensor:
         """The last image (B, 3, 64, 64) uint8, computed again if the state was assigned; do not write to it."""
         if self._observation is None:
-            self._observation = core.observe(self.model, self.env_state)
+            self._observation = self._seen(core.observe(self.model, self.env_state), self.env_state)
         return self._observation
+
+    def _seen(self, image: Tensor, state: EnvState) -> Tensor:
+        """An image as the policy gets it."""
+        if self.conditions is None or not self.conditions.hides_pixels:
+            return image
+        return varied.seen(state.conditions, state.steps, image)
 
     def detach(self) -> None:
         """Detach the state, and the physics of the last reset, from the autograd graph."""
@@ -273,8 +288,9 @@ class TorchEnv:
             core.check_stability(self.model, physics)
         drawn = self._initial_positions.draw(seed, mask, options.get("positions"), self._like)
         index = to_device(np.flatnonzero(mask), self.device)
-        chosen = tree.map(Tensor.clone if whole else lambda t: t[index], (drawn.positions, physics))
-        fresh, observation = core.reset(self.model, *chosen)
+        conditions, all_physics = self._draw_conditions(seed, physics)
+        chosen = tree.map(Tensor.clone if whole else lambda t: t[index], (drawn.positions, all_physics, conditions))
+        fresh, observation = self._begin(*chosen)
         info = core.info_of(self.model, fresh, fresh.start)
         actuation = None
         if not whole:
@@ -283,7 +299,7 @@ class TorchEnv:
             kept = replace(old, physics={}), self.observation(), core.info_of(self.model, old, now)
             others = replace(fresh, physics={}), observation, info
             fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
-            fresh = replace(fresh, physics=merged(self.spec, old.physics, physics, where, self._like))
+            fresh = replace(fresh, physics=merged(self.spec, old.physics, all_physics, where, self._like))
             actuation = self._actuation_without(where)
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         if drawn is not self._initial_positions:
@@ -291,6 +307,31 @@ class TorchEnv:
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
         self._env_state, self._actuation, self._observation = fresh, actuation, observation
         return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
+
+    def _draw_conditions(self, seed: Seed, physics: Physics) -> tuple[Drawn, Physics]:
+        """The conditions of the next episodes of all elements, and the constants of the matter in them."""
+        if self.conditions is None:
+            return {}, physics
+        seeds = varied.first_seeds(self._initial_positions.seeds(seed), self.device)
+        if self._env_state is not None:
+            seeds = torch.where(seeds < 0, varied.next_seeds(self._env_state.conditions), seeds)
+        drawn = varied.draw(self.conditions, seeds.abs(), self.action_shape, self._like)
+        if self.conditions.changes(self.spec):
+            physics = varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
+            core.check_stability(self.model, physics)
+        return drawn, physics
+
+    def _begin(self, positions: Tensor, physics: Physics, conditions: Drawn) -> tuple[EnvState, Tensor]:
+        """State and observation of new episodes."""
+        if self.conditions is None:
+            return core.reset(self.model, positions, physics)
+        velocity = None
+        if self.conditions.moves_start:
+            positions = varied.start(conditions, positions, self.model.num_robot_particles)
+            velocity = conditions["velocity"]
+        state, image = core.reset(self.model, positions, physics, velocity)
+        state = replace(state, conditions=conditions)
+        return state, self._seen(image, state)
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
@@ -322,15 +363,24 @@ class TorchEnv:
                 "from the state after it: use dittogym.core.step with its model, which keeps nothing"
             )
         checks.flag("soft", soft)
-        action = to_grid_layout(self._checked(action), self.action_layout)
+        action, state = self._checked(action), self.env_state
+        if self.conditions is not None:
+            action, drawn = varied.act(self.conditions, state.conditions, state.steps, action)
+            state = replace(state, conditions=drawn)
+        action = to_grid_layout(action, self.action_layout)
         simulate = core.simulate if self._replayed is None or torch.is_grad_enabled() else self._replayed
-        result = core.judge(self.model, simulate(self.model, self.env_state, action), soft=soft)
+        result = core.judge(self.model, simulate(self.model, state, action), soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
-        self._observation = result.observation.clone()  # what is returned belongs to the caller
+        image, smooth = (
+            None if each is None else self._seen(each, result.state)
+            for each in (result.observation, result.soft_observation)
+        )
+        assert image is not None
+        self._observation = image.clone()  # what is returned belongs to the caller
         self._env_state, self._actuation = result.state, result.actuation.detach()
-        observation = result.observation if result.soft_observation is None else result.soft_observation
+        observation = image if smooth is None else smooth
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
 
     def _checked(self, action: Tensor) -> Tensor:

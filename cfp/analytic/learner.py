@@ -222,7 +222,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     @classmethod
     def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> CFPAnalytic:
         """Networks, memory and environment of a stage."""
-        env = make_env(config.for_training(), config.action_size(stage))
+        env = make_env(config.for_training(), config.action_size(stage), conditions=config.conditions(stage))
         learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.actor)
         learner.restart_average()

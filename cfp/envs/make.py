@@ -50,9 +50,10 @@ def make_env(
     num_envs: int | None = None,
     max_episode_steps: int | None = None,
     tensors: bool = False,
+    **changes: Any,
 ) -> VecMonitor:
     """Create the environment of a run for stable-baselines3, see `make_torch_env` and `TorchVecEnv`."""
-    return monitored(make_torch_env(config, resolution, num_envs), max_episode_steps, tensors)
+    return monitored(make_torch_env(config, resolution, num_envs, **changes), max_episode_steps, tensors)
 
 
 def gpu_memory(device: str) -> int | None:

@@ -603,7 +603,8 @@ class CFPSAC(SACLearner, CoarseToFine):
     def create(cls, config: SACConfig, stage: int, folder: Path) -> CFPSAC:
         """Networks, replay memory and environment of a stage."""
         tensors = choose_device(config.device) != "cpu"
-        env = make_env(config, config.action_size(stage), None, config.max_episode_steps, tensors)
+        size, conditions = config.action_size(stage), config.conditions(stage)
+        env = make_env(config, size, None, config.max_episode_steps, tensors, conditions=conditions)
         learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": config.actor_spec(stage)})
         assert isinstance(learner, CFPSAC)
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.networks()[0])

@@ -108,7 +108,7 @@ class InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
         if seed is None and given is None and len(self.positions) and not self.resample:
             return self
-        seeds, generators = self._seeds(seed), dict(self.generators)
+        seeds, generators = self.seeds(seed), dict(self.generators)
         # Every element has positions from the first draw on.
         redrawn = mask.copy() if len(self.positions) else np.ones_like(mask)
         for i in np.flatnonzero(redrawn).tolist():
@@ -137,7 +137,8 @@ class InitialPositions:
             self._check_inside(positions, np.arange(self.num_envs))
         return replace(self, generators=generators, positions=positions)
 
-    def _seeds(self, seed: Seed) -> Sequence[int | None]:
+    def seeds(self, seed: Seed) -> Sequence[int | None]:
+        """The seed of every element."""
         if seed is None:
             return [None] * self.num_envs
         seed = seed.tolist() if isinstance(seed, np.ndarray) and seed.ndim else seed

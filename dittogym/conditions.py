@@ -1,0 +1,267 @@
+"""Conditions that differ from episode to episode: starts, constants of the matter, and disturbances of every step.
+
+What is random depends on nothing but the seed of an element's episode and the number of the step, so that an element
+has the same episode in a batch of any size, and a saved state continues as it did.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dittogym.action import bicubic
+from dittogym.copies import to_device
+from dittogym.physics import Physics, default, has_effect
+from dittogym.spec import TaskSpec
+from torchmpm import checks
+
+#: What the conditions of B episodes are, and what they remember: tensors by name, with a leading B.
+Drawn: TypeAlias = Mapping[str, Tensor]
+#: Bounds of a uniform distribution; a single number stands for both.
+Range: TypeAlias = "float | tuple[float, float]"
+
+#: Streams of random numbers.
+_CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
+#: Constants of the matter whose factors are drawn.
+_FACTORS = ("mu", "yield_stress", "gravity")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """From which ranges each episode draws its conditions, uniformly; a single number is always taken.
+
+    Entries of actions are those of the policy's own grid.
+
+    Raises:
+        ValueError: A range is empty or out of bounds.
+    """
+
+    latency: int | tuple[int, int] = 0
+    """Control steps by which actions come late; the first ones of an episode are 0."""
+    action_noise: Range = 0.0
+    """Standard deviation of normal noise on each entry of an action, drawn anew in every step; 1 is full actuation."""
+    action_dropout: Range = 0.0
+    """Share of the entries of an action that are set to 0 in every step."""
+    observation_dropout: Range = 0.0
+    """Share of the entries of an image, 3 x 64 x 64, that are set to 0 in every step."""
+    mu: Range = 1.0
+    """Factor on the second Lame parameter of the robot, and of objects without a material of their own."""
+    yield_stress: Range = 1.0
+    """Factor on the yield stress of the robot."""
+    gravity: Range = 1.0
+    """Factor on gravity."""
+    shift: float = 0.0
+    """The robot starts up to so far, m, from its place, in x and in y, but not lower."""
+    turn: float = 0.0
+    """The robot starts turned by up to so many degrees."""
+    velocity: float = 0.0
+    """The robot starts with up to so many m/s in x and in y."""
+    chance: float = 1.0
+    """Probability with which each of these applies to an episode."""
+    grid: int | None = None
+    """Rows and columns of the grid on which a policy decides, if it is smaller than that of its actions."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if each.name == "grid":
+                if value is not None:
+                    checks.whole("grid", value, 1)
+                continue
+            pair = isinstance(value, list | tuple)
+            if pair and (each.name in ("shift", "turn", "velocity", "chance") or len(value) != 2):
+                raise ValueError(f"{each.name} must be a number{'' if len(value) == 2 else ' or a pair'}, got {value}")
+            low, high = (_checked(each.name, part) for part in (value if pair else (value, value)))
+            if low > high:
+                raise ValueError(f"{each.name} must be a pair (lowest, highest), got {value}")
+            if pair:
+                object.__setattr__(self, each.name, (low, high))
+
+    def bounds(self, name: str) -> tuple[Any, Any]:
+        """Lowest and highest value of a field."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
+
+    @property
+    def hides_pixels(self) -> bool:
+        """Whether images may lose entries."""
+        return self.bounds("observation_dropout")[1] > 0
+
+    @property
+    def moves_start(self) -> bool:
+        """Whether starts differ."""
+        return any((self.shift, self.turn, self.velocity))
+
+    def changes(self, spec: TaskSpec) -> list[str]:
+        """The constants of the matter that these conditions change in a task."""
+        changed = [name for name in _FACTORS if self.bounds(name) != (1.0, 1.0) and has_effect(spec, name)]
+        return changed if any(spec.gravity) else [name for name in changed if name != "gravity"]
+
+
+def as_conditions(given: Any) -> Conditions | None:
+    """Conditions as they are; a mapping, such as JSON holds, by the names of the fields."""
+    if given is None or isinstance(given, Conditions):
+        return given
+    if not isinstance(given, Mapping):
+        raise ValueError(f"conditions must be dittogym.Conditions or a mapping, got {type(given).__name__}")
+    names = [each.name for each in fields(Conditions)]
+    if unknown := [name for name in given if name not in names]:
+        raise ValueError(f"conditions may hold {', '.join(names)}, got {', '.join(map(repr, unknown))}")
+    return Conditions(**given)
+
+
+def _checked(name: str, value: Any) -> float:
+    if name == "latency":
+        return checks.whole(name, value, 0)
+    highest = {"action_dropout": 1.0, "observation_dropout": 1.0, "chance": 1.0}.get(name, math.inf)
+    checks.number(name, value, least=0.0)
+    if value > highest:
+        raise ValueError(f"{name} must be at most {highest:g}, got {value}")
+    return float(value)
+
+
+# Random numbers.
+
+
+def _mixed(x: Tensor) -> Tensor:
+    """A hash of whole numbers (the finaliser of SplitMix64; Steele et al., OOPSLA 2014), with int64 that wraps."""
+    for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15)):
+        x = (x ^ ((x >> shift) & ((1 << (64 - shift)) - 1))) * factor
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
+
+
+def _bits(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
+    """Random whole numbers (B, count), which depend on the seed (B,), the stream and the step."""
+    keys = _mixed(_mixed(seed + 0x1E3779B97F4A7C15 * (stream + 1)) + step)
+    index = torch.arange(1, count + 1, device=seed.device)
+    return _mixed(keys[:, None] - 0x61C8864680B583EB * index)
+
+
+def uniform(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
+    """Random numbers (B, count) in [0, 1), float32, of seeds (B,)."""
+    return ((_bits(seed, stream, step, count) >> 40) & 0xFFFFFF).float() * 2.0**-24
+
+
+def _normal(seed: Tensor, stream: int, step: Tensor, count: int) -> Tensor:
+    """Normal random numbers (B, count) (Box and Muller)."""
+    first, second = uniform(seed, stream, step, 2 * count).unflatten(1, (2, count)).unbind(1)
+    return (-2.0 * torch.log1p(-first)).sqrt() * (2.0 * math.pi * second).cos()
+
+
+# Episodes.
+
+
+def draw(conditions: Conditions, seeds: Tensor, action_shape: Sequence[int], like: Tensor) -> Drawn:
+    """The conditions of episodes with these seeds (B,) int64.
+
+    Args:
+        conditions: Their ranges.
+        seeds: Of the episodes.
+        action_shape: (2, R, R).
+        like: Gives dtype and device.
+    """
+    names = [each.name for each in fields(Conditions) if each.name not in ("chance", "grid")]
+    chosen = uniform(seeds, _CHANCE, 0, len(names)) < conditions.chance
+    numbers = uniform(seeds, _VALUE, 0, len(names) + 3)  # shift and velocity have two axes
+    drawn: dict[str, Tensor] = {"seed": seeds}
+    for i, name in enumerate(names):
+        low, high = conditions.bounds(name)
+        where, number = chosen[:, i], numbers[:, i]
+        if name == "latency":
+            drawn[name] = torch.where(where, (low + number * (high - low + 1)).long(), 0)
+        elif name in ("shift", "velocity"):
+            two = torch.stack((number, numbers[:, len(names) + (name == "velocity")]), 1)
+            drawn[name] = torch.where(where[:, None], high * (2.0 * two - 1.0), 0.0).to(like)
+        elif name == "turn":
+            drawn[name] = torch.where(where, math.radians(high) * (2.0 * number - 1.0), 0.0).to(like)
+        else:
+            neutral = 1.0 if name in _FACTORS else 0.0
+            drawn[name] = torch.where(where, low + number * (high - low), neutral).to(like)
+    steps = conditions.bounds("latency")[1]
+    drawn["pending"] = like.new_zeros(len(seeds), steps, *action_shape)
+    return drawn
+
+
+def first_seeds(seeds: Sequence[int | None], device: torch.device) -> Tensor:
+    """Seeds (B,) of episodes: those given; elsewhere arbitrary ones, negated."""
+    arbitrary = np.random.default_rng().integers(1, 2**62, size=len(seeds))
+    host = [-int(other) if seed is None else seed for seed, other in zip(seeds, arbitrary, strict=True)]
+    return to_device(np.array(host, np.int64), device)
+
+
+def next_seeds(drawn: Drawn) -> Tensor:
+    """Seeds (B,) of the episodes that follow without a seed of their own."""
+    return _bits(drawn["seed"], _NEXT, 0, 1)[:, 0] >> 1
+
+
+def start(drawn: Drawn, positions: Tensor, robot: int) -> Tensor:
+    """Initial positions (B, N, 2), m, with the robot, the first particles, turned and shifted, but not lowered."""
+    body = positions[:, :robot]
+    centre = body.mean(1, keepdim=True)
+    cos, sin = drawn["turn"].cos(), drawn["turn"].sin()
+    rotation = torch.stack((cos, -sin, sin, cos), 1).view(-1, 2, 2)
+    moved = centre + (body - centre) @ rotation.mT + drawn["shift"][:, None]
+    sunk = (body[..., 1].amin(1) - moved[..., 1].amin(1)).clamp_min(0.0)
+    moved = moved + torch.stack((torch.zeros_like(sunk), sunk), 1)[:, None]
+    return torch.cat((moved, positions[:, robot:]), 1)
+
+
+def physics_of(conditions: Conditions, drawn: Drawn, spec: TaskSpec, physics: Physics, like: Tensor) -> Physics:
+    """Constants of the matter with the factors of the episodes, for B simulations, B the length of ``like``."""
+    changed = {}
+    for name in conditions.changes(spec):
+        value = physics[name] if name in physics else default(spec, name, like)
+        factor = drawn[name]
+        changed[name] = value * (factor if value.ndim == 1 else factor[:, None])
+    return {**physics, **changed}
+
+
+def act(conditions: Conditions, drawn: Drawn, steps: Tensor, action: Tensor) -> tuple[Tensor, Drawn]:
+    """What an action comes to: late, with noise, and without some of its entries.
+
+    Args:
+        conditions: Their ranges.
+        drawn: Of the episodes.
+        steps: (B,) control steps taken before this one.
+        action: (B, 2, R, R).
+
+    Returns:
+        The action that is carried out, and what the episodes remember from here on.
+    """
+    seed = drawn["seed"]
+    if conditions.bounds("latency")[1]:
+        actions = torch.cat((action[:, None], drawn["pending"]), 1)
+        action = actions[torch.arange(len(actions), device=actions.device), drawn["latency"]]
+        drawn = {**drawn, "pending": actions[:, :-1]}
+    size = action.shape[-1]
+    grid = conditions.grid or size
+    shape = (2, grid, grid)
+    if conditions.bounds("action_noise")[1]:
+        noise = _normal(seed, _NOISE, steps, math.prod(shape)).view(-1, *shape).to(action)
+        noise = noise if grid == size else bicubic(noise, size)
+        action = action + drawn["action_noise"][:, None, None, None] * noise
+    if conditions.bounds("action_dropout")[1]:
+        numbers = uniform(seed, _ACTION, steps, math.prod(shape)).view(-1, *shape)
+        action = drop(action, numbers < drawn["action_dropout"][:, None, None, None])
+    return action, drawn
+
+
+def drop(values: Tensor, mask: Tensor) -> Tensor:
+    """Set entries of (B, ..., A, A) to 0, selected by a bool mask (B, ..., R, R) whose entries cover whole cells."""
+    if mask.shape != values.shape:
+        size, grid = values.shape[-1], mask.shape[-1]
+        cell = torch.arange(size, device=mask.device) * grid // size
+        mask = mask[..., cell[:, None], cell]
+    return values.masked_fill(mask, 0)
+
+
+def seen(drawn: Drawn, steps: Tensor, image: Tensor) -> Tensor:
+    """Images (B, 3, 64, 64) without some of their entries, after ``steps`` (B,) control steps."""
+    numbers = uniform(drawn["seed"], _PIXEL, steps, math.prod(image.shape[1:])).view(image.shape)
+    return image.masked_fill(numbers < drawn["observation_dropout"][:, None, None, None], 0)
