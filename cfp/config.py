@@ -211,6 +211,8 @@ class StagedConfig(RunConfig):
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
     """paper (the paper's), or small (half the size and width; actions join its features)."""
+    history: int = 0
+    """Latest actions that the policy sees beside the image."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
     @property
@@ -240,6 +242,7 @@ class StagedConfig(RunConfig):
             interpolation=self.interpolation,
             patch=None if self.interpolation == "aligned" else make_spec(self.task).patch,
             encoder=self.encoder,
+            history=self.history,
         )
 
     def check(self) -> None:
@@ -252,6 +255,7 @@ class StagedConfig(RunConfig):
                 raise ConfigError(f"{option.name} must have at least one value")
         self.actor_spec(len(self.resolutions))  # checks the resolutions
         check_at_least(1, steps=self.steps)
+        check_at_least(0, history=self.history)
         check_positive(gate_scale=self.gate_scale)
         if len(self.handover) < (count := len(self.resolutions) - 1):
             raise ConfigError(

@@ -22,6 +22,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
+from cfp.agent import history
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError, brief
@@ -156,20 +157,31 @@ class ActorPolicy(nn.Module, Shareable):
 
         Args:
             observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
-            state: Hidden state with leading B, returned as it is: the policy has no memory.
-            episode_start: (B,) bool, without effect.
+            state: What the last call returned, of a policy that sees its latest actions; None at the start.
+            episode_start: (B,) bool, which robots begin an episode.
             deterministic: Act without noise.
 
         Returns:
-            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
+            Actions (2, R, R) or (B, 2, R, R) float32, and the ``state`` for the next call: the latest actions
+            (B, H, 2, R, R) in a tuple; as it was given for a policy without memory.
 
         Raises:
             ValueError: The observation is neither an image nor a batch of images.
         """
         check_images(observation)
         assert isinstance(observation, np.ndarray)
-        action, _ = self.predict_with_gate(observation.reshape(-1, *SHAPE), deterministic)
-        return action if observation.ndim == 4 else action[0], state
+        images = observation.reshape(-1, *SHAPE)
+        if not (length := self.spec.history):
+            action, _ = self.predict_with_gate(images, deterministic)
+            return action if observation.ndim == 4 else action[0], state
+        shape = (len(images), length, 2, self.resolution, self.resolution)
+        latest = torch.zeros(shape) if state is None else torch.as_tensor(state[0])
+        if episode_start is not None:
+            latest = history.clear(latest, torch.as_tensor(episode_start))
+        seen = history.stack(torch.as_tensor(images), latest)
+        action, _ = self.predict_with_gate(seen.numpy(), deterministic)
+        latest = history.push(latest, torch.from_numpy(action))
+        return action if observation.ndim == 4 else action[0], (latest.numpy(),)
 
     @torch.no_grad()
     def predict_with_gate(
@@ -178,7 +190,7 @@ class ActorPolicy(nn.Module, Shareable):
         """Choose actions, and show how the last stage blends them with those of the coarser one.
 
         Args:
-            observation: (B, 3, 64, 64) uint8.
+            observation: (B, 3, 64, 64) uint8, with the latest actions if it sees them, see `cfp.agent.history.stack`.
             deterministic: Act without noise.
 
         Returns:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from cfp.agent import history
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import Critic, StateFeatures, check_norms, descend, make_adam, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
@@ -182,7 +183,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     config: AnalyticConfig
     parts = ("regression", "memory", "critic", "collector", "action_step")
-    values = ("generator", "empty_windows")
+    values = ("generator", "empty_windows", "latest_actions")
     presets = ("quick",)
 
     def _setup_model(self) -> None:
@@ -207,12 +208,22 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         self.collector = WindowCollector(self.simulation, lambda: self.features(self.simulation).float(), config)
         self.action_step = ActionStep()
         self.empty_windows = 0
-        image = self.simulation.observation()
+        image, size = self.simulation.observation(), config.action_size(self.stage)
         self._last_obs = image.cpu().numpy()
+        self.latest_actions = torch.zeros(self.n_envs, config.history, 2, size, size, device=self.device)
+        seen = self.observe()
         with torch.no_grad():
-            outputs = self.actor.outputs(image, deterministic=True, generator=self.generator)
-        example = (image[0], outputs.location[0])
+            outputs = self.actor.outputs(seen, deterministic=True, generator=self.generator)
+        example = (seen[0], outputs.location[0])
         self.memory = ImageMemory(config.windows_kept * config.window * self.n_envs, example)
+
+    def observe(self) -> Tensor:
+        """What the policy sees now."""
+        image = self.simulation.observation()
+        if not self.config.history:
+            return image
+        self.latest_actions = history.clear(self.latest_actions, self.simulation.env_state.steps == 0)
+        return history.stack(image, self.latest_actions)
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
@@ -299,11 +310,14 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         leaves: list[Tensor] = []
 
         def act(_: Tensor) -> Tensor:
-            images.append(self.simulation.observation())
+            images.append(self.observe())
             with torch.no_grad():
                 outputs = self.actor.outputs(images[-1], generator=self.generator)
                 leaves.append(outputs.location.clamp(-BOUND, BOUND))
-            return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
+            action = self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
+            if self.config.history:
+                self.latest_actions = history.push(self.latest_actions, action)
+            return action
 
         with torch.set_grad_enabled(step_size > 0):
             window = self.collector.collect(act, self.critic, self.after_step)
@@ -330,7 +344,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def images(self) -> dict[str, np.ndarray]:
         """What the policy does with the observation of the first robot."""
-        return policy_pictures(self.trained_actor, self.simulation.observation()[:1])
+        return policy_pictures(self.trained_actor, self.observe()[:1])
 
     @property
     def trained_actor(self) -> Actor:
