@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dittogym.action import bicubic
+from dittogym.bodies.positions import check_robot_at, probe
 from dittogym.copies import to_device
 from dittogym.physics import Physics, default, has_effect
 from dittogym.spec import TaskSpec
@@ -30,6 +31,10 @@ Range: TypeAlias = "float | tuple[float, float]"
 _CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
 #: Constants of the matter whose factors are drawn.
 _FACTORS = ("mu", "yield_stress", "gravity")
+#: What an episode draws, in the order of its random numbers.
+_NAMES = ("latency", "action_noise", "action_dropout", "observation_dropout", *_FACTORS, "shift", "turn", "velocity")
+#: Fields that are no ranges.
+_SINGLE = ("shift", "turn", "velocity", "chance")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,20 +73,19 @@ class Conditions:
     """Rows and columns of the grid on which a policy decides, if it is smaller than that of its actions."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if each.name == "grid":
-                if value is not None:
-                    checks.whole("grid", value, 1)
-                continue
-            pair = isinstance(value, list | tuple)
-            if pair and (each.name in ("shift", "turn", "velocity", "chance") or len(value) != 2):
-                raise ValueError(f"{each.name} must be a number{'' if len(value) == 2 else ' or a pair'}, got {value}")
-            low, high = (_checked(each.name, part) for part in (value if pair else (value, value)))
+        if self.grid is not None:
+            checks.whole("grid", self.grid, 1)
+        for name in (*_NAMES, "chance"):
+            given = getattr(self, name)
+            pair = isinstance(given, list | tuple)
+            if pair and (name in _SINGLE or len(given) != 2):
+                allowed = "a number" if name in _SINGLE else "a number or a pair (lowest, highest)"
+                raise ValueError(f"{name} must be {allowed}, got {given}")
+            low, high = (_checked(name, part) for part in (given if pair else (given, given)))
             if low > high:
-                raise ValueError(f"{each.name} must be a pair (lowest, highest), got {value}")
+                raise ValueError(f"{name} must be a pair (lowest, highest), got {given}")
             if pair:
-                object.__setattr__(self, each.name, (low, high))
+                object.__setattr__(self, name, (low, high))
 
     def bounds(self, name: str) -> tuple[Any, Any]:
         """Lowest and highest value of a field."""
@@ -120,7 +124,7 @@ def _checked(name: str, value: Any) -> float:
     if name == "latency":
         return checks.whole(name, value, 0)
     highest = {"action_dropout": 1.0, "observation_dropout": 1.0, "chance": 1.0}.get(name, math.inf)
-    checks.number(name, value, least=0.0)
+    checks.number(name, value, **({"above": 0.0} if name == "mu" else {"least": 0.0}))
     if value > highest:
         raise ValueError(f"{name} must be at most {highest:g}, got {value}")
     return float(value)
@@ -138,7 +142,7 @@ def _mixed(x: Tensor) -> Tensor:
 
 def _bits(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
     """Random whole numbers (B, count), which depend on the seed (B,), the stream and the step."""
-    keys = _mixed(_mixed(seed + 0x1E3779B97F4A7C15 * (stream + 1)) + step)
+    keys = _mixed(_mixed(_mixed(seed) + stream) + step)
     index = torch.arange(1, count + 1, device=seed.device)
     return _mixed(keys[:, None] - 0x61C8864680B583EB * index)
 
@@ -166,25 +170,25 @@ def draw(conditions: Conditions, seeds: Tensor, action_shape: Sequence[int], lik
         action_shape: (2, R, R).
         like: Gives dtype and device.
     """
-    names = [each.name for each in fields(Conditions) if each.name not in ("chance", "grid")]
-    chosen = uniform(seeds, _CHANCE, 0, len(names)) < conditions.chance
-    numbers = uniform(seeds, _VALUE, 0, len(names) + 3)  # shift and velocity have two axes
+    chosen = uniform(seeds, _CHANCE, 0, len(_NAMES)) < conditions.chance
+    # In float64, in which neither bounds nor whole numbers are rounded; shift and velocity have two axes.
+    numbers = uniform(seeds, _VALUE, 0, len(_NAMES) + 2).double()
     drawn: dict[str, Tensor] = {"seed": seeds}
-    for i, name in enumerate(names):
+    for i, name in enumerate(_NAMES):
         low, high = conditions.bounds(name)
         where, number = chosen[:, i], numbers[:, i]
         if name == "latency":
             drawn[name] = torch.where(where, (low + number * (high - low + 1)).long(), 0)
         elif name in ("shift", "velocity"):
-            two = torch.stack((number, numbers[:, len(names) + (name == "velocity")]), 1)
+            two = torch.stack((number, numbers[:, len(_NAMES) + (name == "velocity")]), 1)
             drawn[name] = torch.where(where[:, None], high * (2.0 * two - 1.0), 0.0).to(like)
         elif name == "turn":
             drawn[name] = torch.where(where, math.radians(high) * (2.0 * number - 1.0), 0.0).to(like)
         else:
             neutral = 1.0 if name in _FACTORS else 0.0
             drawn[name] = torch.where(where, low + number * (high - low), neutral).to(like)
-    steps = conditions.bounds("latency")[1]
-    drawn["pending"] = like.new_zeros(len(seeds), steps, *action_shape)
+    if steps := conditions.bounds("latency")[1]:
+        drawn["pending"] = like.new_zeros(len(seeds), steps, *action_shape)
     return drawn
 
 
@@ -203,10 +207,10 @@ def next_seeds(drawn: Drawn) -> Tensor:
 def start(drawn: Drawn, positions: Tensor, robot: int) -> Tensor:
     """Initial positions (B, N, 2), m, with the robot, the first particles, turned and shifted, but not lowered."""
     body = positions[:, :robot]
-    centre = body.mean(1, keepdim=True)
-    cos, sin = drawn["turn"].cos(), drawn["turn"].sin()
-    rotation = torch.stack((cos, -sin, sin, cos), 1).view(-1, 2, 2)
-    moved = centre + (body - centre) @ rotation.mT + drawn["shift"][:, None]
+    x, y = (body - body.mean(1, keepdim=True)).unbind(-1)
+    less, sin = drawn["turn"].cos()[:, None] - 1.0, drawn["turn"].sin()[:, None]
+    # Differences, which are exactly 0 in an episode without a turn.
+    moved = body + torch.stack((less * x - sin * y, sin * x + less * y), -1) + drawn["shift"][:, None]
     sunk = (body[..., 1].amin(1) - moved[..., 1].amin(1)).clamp_min(0.0)
     moved = moved + torch.stack((torch.zeros_like(sunk), sunk), 1)[:, None]
     return torch.cat((moved, positions[:, robot:]), 1)
@@ -220,6 +224,30 @@ def physics_of(conditions: Conditions, drawn: Drawn, spec: TaskSpec, physics: Ph
         factor = drawn[name]
         changed[name] = value * (factor if value.ndim == 1 else factor[:, None])
     return {**physics, **changed}
+
+
+def largest_physics(conditions: Conditions, spec: TaskSpec, physics: Physics, like: Tensor) -> Physics:
+    """Constants of the matter with the largest factors, for B simulations."""
+    largest = {name: torch.full_like(like, conditions.bounds(name)[1]) for name in _FACTORS}
+    return physics_of(conditions, largest, spec, physics, like)
+
+
+def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:
+    """Refuse a grid larger than that of the actions, and starts where a task has no room for the robot."""
+    if conditions.grid is not None and conditions.grid > resolution:
+        raise ValueError(f"conditions must have a grid of at most {resolution}, as actions have, got {conditions.grid}")
+    if not (conditions.shift or conditions.turn):
+        return
+    turns = math.radians(conditions.turn) * torch.linspace(-1.0, 1.0, 9, dtype=torch.float64)
+    corners = conditions.shift * torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]], dtype=torch.float64)
+    drawn = {"turn": turns.repeat_interleave(4), "shift": corners.repeat(9, 1)}
+    points = torch.from_numpy(probe(spec.robot))
+    for moved in start(drawn, points.expand(36, -1, -1), len(points)).numpy():
+        try:
+            check_robot_at(spec, moved, moved.min(0), moved.max(0))
+        except ValueError as error:
+            ranges = f"shift={conditions.shift:g} and turn={conditions.turn:g}"
+            raise ValueError(f"conditions must leave the robot room, got {ranges}, with which {error}") from error
 
 
 def act(conditions: Conditions, drawn: Drawn, steps: Tensor, action: Tensor) -> tuple[Tensor, Drawn]:
