@@ -152,6 +152,13 @@ def uniform(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor
     return ((_bits(seed, stream, step, count) >> 40) & 0xFFFFFF).float() * 2.0**-24
 
 
+def _chosen(seed: Tensor, stream: int, step: Tensor, share: Tensor, shape: Sequence[int]) -> Tensor:
+    """Random entries (B, *shape), bool, each chosen with the probability ``share`` (B,), rounded to 16 bits."""
+    count = math.prod(shape)
+    numbers = _bits(seed, stream, step, math.ceil(count / 4)).view(torch.int16)[:, :count]  # four from one hash
+    return (numbers < (2.0**16 * share - 2.0**15)[:, None]).view(-1, *shape)
+
+
 def _normal(seed: Tensor, stream: int, step: Tensor, count: int) -> Tensor:
     """Normal random numbers (B, count) (Box and Muller)."""
     first, second = uniform(seed, stream, step, 2 * count).unflatten(1, (2, count)).unbind(1)
@@ -275,8 +282,7 @@ def act(conditions: Conditions, drawn: Drawn, steps: Tensor, action: Tensor) -> 
         noise = noise if grid == size else bicubic(noise, size)
         action = action + drawn["action_noise"][:, None, None, None] * noise
     if conditions.bounds("action_dropout")[1]:
-        numbers = uniform(seed, _ACTION, steps, math.prod(shape)).view(-1, *shape)
-        action = drop(action, numbers < drawn["action_dropout"][:, None, None, None])
+        action = drop(action, _chosen(seed, _ACTION, steps, drawn["action_dropout"], shape))
     return action, drawn
 
 
@@ -291,5 +297,4 @@ def drop(values: Tensor, mask: Tensor) -> Tensor:
 
 def seen(drawn: Drawn, steps: Tensor, image: Tensor) -> Tensor:
     """Images (B, 3, 64, 64) without some of their entries, after ``steps`` (B,) control steps."""
-    numbers = uniform(drawn["seed"], _PIXEL, steps, math.prod(image.shape[1:])).view(image.shape)
-    return image.masked_fill(numbers < drawn["observation_dropout"][:, None, None, None], 0)
+    return drop(image, _chosen(drawn["seed"], _PIXEL, steps, drawn["observation_dropout"], image.shape[1:]))

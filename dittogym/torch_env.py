@@ -386,7 +386,8 @@ class TorchEnv:
         checks.flag("soft", soft)
         action, state = self._checked(action), self.env_state
         if self.conditions is not None:
-            action, drawn = varied.act(self.conditions, state.conditions, state.steps, action)
+            drawn = tree.without_inference(state.conditions)
+            action, drawn = varied.act(self.conditions, drawn, state.steps, action)
             state = replace(state, conditions=drawn)
         action = to_grid_layout(action, self.action_layout)
         simulate = core.simulate if self._replayed is None or torch.is_grad_enabled() else self._replayed
