@@ -41,10 +41,21 @@ _SINGLE = ("shift", "turn", "velocity", "chance")
 class Conditions:
     """From which ranges each episode draws its conditions, uniformly; a single number is always taken.
 
-    Entries of actions are those of the policy's own grid.
+    Entries of actions are those of the policy's own grid. A factor has no effect in a task whose bodies do not take the
+    constant. Rewards, ``info`` and pictures show what happens, not what the policy sees.
 
     Raises:
-        ValueError: A range is empty or out of bounds.
+        ValueError: A range is empty or out of bounds. The environment raises one where it has no room for a start, or
+            too few substeps for the matter.
+
+    Examples:
+        >>> import dittogym
+        >>> conditions = dittogym.Conditions(latency=(0, 2), action_dropout=0.2, mu=(0.8, 1.2), turn=5.0)
+        >>> env = dittogym.TorchEnv("run", num_envs=4, particles="lite", conditions=conditions)
+        >>> observation, info = env.reset(seed=0)
+        >>> late = env.env_state.conditions["latency"]  # of each episode
+        >>> late.shape, bool((late <= 2).all())
+        (torch.Size([4]), True)
     """
 
     latency: int | tuple[int, int] = 0
@@ -88,7 +99,7 @@ class Conditions:
                 object.__setattr__(self, name, (low, high))
 
     def bounds(self, name: str) -> tuple[Any, Any]:
-        """Lowest and highest value of a field."""
+        """Lowest and highest value of the field ``name``."""
         value = getattr(self, name)
         return value if isinstance(value, tuple) else (value, value)
 
@@ -103,7 +114,7 @@ class Conditions:
         return any((self.shift, self.turn, self.velocity))
 
     def changes(self, spec: TaskSpec) -> list[str]:
-        """The constants of the matter that these conditions change in a task."""
+        """The constants of the matter that these conditions change in the task ``spec``."""
         changed = [name for name in _FACTORS if self.bounds(name) != (1.0, 1.0) and has_effect(spec, name)]
         return changed if any(spec.gravity) else [name for name in changed if name != "gravity"]
 
