@@ -7,6 +7,7 @@ has the same episode in a batch of any size, and a saved state continues as it d
 from __future__ import annotations
 
 import math
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
@@ -212,8 +213,7 @@ def draw(conditions: Conditions, seeds: Tensor, action_shape: Sequence[int], lik
 
 def first_seeds(seeds: Sequence[int | None], device: torch.device) -> Tensor:
     """Seeds (B,) of episodes: those given; elsewhere arbitrary ones, negated."""
-    arbitrary = np.random.default_rng().integers(1, 2**62, size=len(seeds))
-    host = [-int(other) if seed is None else seed for seed, other in zip(seeds, arbitrary, strict=True)]
+    host = [-1 - secrets.randbits(61) if seed is None else seed for seed in seeds]
     return to_device(np.array(host, np.int64), device)
 
 
