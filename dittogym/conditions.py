@@ -6,6 +6,7 @@ has the same episode in a batch of any size, and a saved state continues as it d
 
 from __future__ import annotations
 
+import itertools
 import math
 import secrets
 from collections.abc import Mapping, Sequence
@@ -211,15 +212,14 @@ def draw(conditions: Conditions, seeds: Tensor, action_shape: Sequence[int], lik
     return drawn
 
 
-def first_seeds(seeds: Sequence[int | None], device: torch.device) -> Tensor:
-    """Seeds (B,) of episodes: those given; elsewhere arbitrary ones, negated."""
-    host = [-1 - secrets.randbits(61) if seed is None else seed for seed in seeds]
-    return to_device(np.array(host, np.int64), device)
-
-
-def next_seeds(drawn: Drawn) -> Tensor:
-    """Seeds (B,) of the episodes that follow without a seed of their own."""
-    return _bits(drawn["seed"], _NEXT, 0, 1)[:, 0] >> 1
+def next_seeds(given: Sequence[int | None], before: Drawn | None, device: torch.device) -> Tensor:
+    """Seeds (B,) of the next episodes: those given; else they follow from the episodes before, or are arbitrary."""
+    seeds = to_device(np.array([-1 if each is None else each for each in given], np.int64), device)
+    if before is None:
+        others = to_device(np.array([secrets.randbits(62) for _ in given], np.int64), device)
+    else:
+        others = _bits(before["seed"], _NEXT, 0, 1)[:, 0] & (2**62 - 1)
+    return torch.where(seeds < 0, others, seeds)
 
 
 def start(drawn: Drawn, positions: Tensor, robot: int) -> Tensor:
@@ -256,11 +256,10 @@ def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:
         raise ValueError(f"conditions must have a grid of at most {resolution}, as actions have, got {conditions.grid}")
     if not (conditions.shift or conditions.turn):
         return
-    turns = math.radians(conditions.turn) * torch.linspace(-1.0, 1.0, 9, dtype=torch.float64)
-    corners = conditions.shift * torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]], dtype=torch.float64)
-    drawn = {"turn": turns.repeat_interleave(4), "shift": corners.repeat(9, 1)}
-    points = torch.from_numpy(probe(spec.robot))
-    for moved in start(drawn, points.expand(36, -1, -1), len(points)).numpy():
+    turns, shifts = np.linspace(-conditions.turn, conditions.turn, 9), (-conditions.shift, conditions.shift)
+    numbers = torch.from_numpy(np.array(list(itertools.product(np.radians(turns), shifts, shifts))))
+    points = torch.from_numpy(probe(spec.robot)).expand(len(numbers), -1, -1)
+    for moved in start({"turn": numbers[:, 0], "shift": numbers[:, 1:]}, points, points.shape[1]).numpy():
         try:
             check_robot_at(spec, moved, moved.min(0), moved.max(0))
         except ValueError as error:

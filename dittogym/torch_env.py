@@ -154,6 +154,8 @@ class TorchEnv:
     def env_state(self) -> EnvState:
         """Everything that moves, for :mod:`dittogym.core`. Assign a state to continue from it.
 
+        An environment without conditions leaves those of the state out; one with conditions needs them.
+
         Raises:
             RuntimeError: It was neither reset nor assigned.
         """
@@ -241,7 +243,7 @@ class TorchEnv:
 
         Raises:
             ValueError: The snapshot is of another task or variant, other numbers of particles, other substeps, another
-                type, device or batch size.
+                type, device or batch size, or without the conditions that this environment has.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs)
@@ -270,6 +272,7 @@ class TorchEnv:
         Args:
             seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
+                Conditions are drawn in either case; those of a seed are always the same.
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; ``"physics"``: constants of the matter, see
                 :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
@@ -323,10 +326,9 @@ class TorchEnv:
         """The conditions of the next episodes of all elements, and the constants of the matter in them."""
         if self.conditions is None:
             return {}, physics
-        seeds = varied.first_seeds(self._initial_positions.seeds(seed), self.device)
-        if self._env_state is not None:
-            seeds = torch.where(seeds < 0, varied.next_seeds(self._env_state.conditions), seeds)
-        drawn = varied.draw(self.conditions, seeds.abs(), self.action_shape, self._like)
+        before = None if self._env_state is None else self._env_state.conditions
+        seeds = varied.next_seeds(self._initial_positions.seeds(seed), before, self.device)
+        drawn = varied.draw(self.conditions, seeds, self.action_shape, self._like)
         if self.conditions.changes(self.spec):
             physics = varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
         return drawn, physics
