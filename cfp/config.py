@@ -318,11 +318,8 @@ class VariationConfig(StagedConfig):
         """Check what the types do not express."""
         super().check()
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
-        for name in ("vary", "vary_actions", "vary_pixels", "vary_physics"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if self.vary_physics == 1:
-            raise ConfigError("vary_physics must be below 1, got 1")
+        check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
+        check_decay(vary_physics=self.vary_physics)
 
 
 @dataclass(frozen=True, kw_only=True)

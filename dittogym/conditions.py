@@ -6,7 +6,9 @@ has the same episode in a batch of any size, and a saved state continues as it d
 
 from __future__ import annotations
 
+import itertools
 import math
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
@@ -16,6 +18,7 @@ import torch
 from torch import Tensor
 
 from dittogym.action import bicubic
+from dittogym.bodies.positions import check_robot_at, probe
 from dittogym.copies import to_device
 from dittogym.physics import Physics, default, has_effect
 from dittogym.spec import TaskSpec
@@ -30,16 +33,31 @@ Range: TypeAlias = "float | tuple[float, float]"
 _CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
 #: Constants of the matter whose factors are drawn.
 _FACTORS = ("mu", "yield_stress", "gravity")
+#: What an episode draws, in the order of its random numbers.
+_NAMES = ("latency", "action_noise", "action_dropout", "observation_dropout", *_FACTORS, "shift", "turn", "velocity")
+#: Fields that are no ranges.
+_SINGLE = ("shift", "turn", "velocity", "chance")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
     """From which ranges each episode draws its conditions, uniformly; a single number is always taken.
 
-    Entries of actions are those of the policy's own grid.
+    Entries of actions are those of the policy's own grid. A factor has no effect in a task whose bodies do not take the
+    constant. Rewards, ``info`` and pictures show what happens, not what the policy sees.
 
     Raises:
-        ValueError: A range is empty or out of bounds.
+        ValueError: A range is empty or out of bounds. The environment raises one where it has no room for a start, or
+            too few substeps for the matter.
+
+    Examples:
+        >>> import dittogym
+        >>> conditions = dittogym.Conditions(latency=(0, 2), action_dropout=0.2, mu=(0.8, 1.2), turn=5.0)
+        >>> env = dittogym.TorchEnv("run", num_envs=4, particles="lite", conditions=conditions)
+        >>> observation, info = env.reset(seed=0)
+        >>> late = env.env_state.conditions["latency"]  # of each episode
+        >>> late.shape, bool((late <= 2).all())
+        (torch.Size([4]), True)
     """
 
     latency: int | tuple[int, int] = 0
@@ -68,23 +86,22 @@ class Conditions:
     """Rows and columns of the grid on which a policy decides, if it is smaller than that of its actions."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if each.name == "grid":
-                if value is not None:
-                    checks.whole("grid", value, 1)
-                continue
-            pair = isinstance(value, list | tuple)
-            if pair and (each.name in ("shift", "turn", "velocity", "chance") or len(value) != 2):
-                raise ValueError(f"{each.name} must be a number{'' if len(value) == 2 else ' or a pair'}, got {value}")
-            low, high = (_checked(each.name, part) for part in (value if pair else (value, value)))
+        if self.grid is not None:
+            checks.whole("grid", self.grid, 1)
+        for name in (*_NAMES, "chance"):
+            given = getattr(self, name)
+            pair = isinstance(given, list | tuple)
+            if pair and (name in _SINGLE or len(given) != 2):
+                allowed = "a number" if name in _SINGLE else "a number or a pair (lowest, highest)"
+                raise ValueError(f"{name} must be {allowed}, got {given}")
+            low, high = (_checked(name, part) for part in (given if pair else (given, given)))
             if low > high:
-                raise ValueError(f"{each.name} must be a pair (lowest, highest), got {value}")
+                raise ValueError(f"{name} must be a pair (lowest, highest), got {given}")
             if pair:
-                object.__setattr__(self, each.name, (low, high))
+                object.__setattr__(self, name, (low, high))
 
     def bounds(self, name: str) -> tuple[Any, Any]:
-        """Lowest and highest value of a field."""
+        """Lowest and highest value of the field ``name``."""
         value = getattr(self, name)
         return value if isinstance(value, tuple) else (value, value)
 
@@ -99,7 +116,7 @@ class Conditions:
         return any((self.shift, self.turn, self.velocity))
 
     def changes(self, spec: TaskSpec) -> list[str]:
-        """The constants of the matter that these conditions change in a task."""
+        """The constants of the matter that these conditions change in the task ``spec``."""
         changed = [name for name in _FACTORS if self.bounds(name) != (1.0, 1.0) and has_effect(spec, name)]
         return changed if any(spec.gravity) else [name for name in changed if name != "gravity"]
 
@@ -120,7 +137,7 @@ def _checked(name: str, value: Any) -> float:
     if name == "latency":
         return checks.whole(name, value, 0)
     highest = {"action_dropout": 1.0, "observation_dropout": 1.0, "chance": 1.0}.get(name, math.inf)
-    checks.number(name, value, least=0.0)
+    checks.number(name, value, **({"above": 0.0} if name == "mu" else {"least": 0.0}))
     if value > highest:
         raise ValueError(f"{name} must be at most {highest:g}, got {value}")
     return float(value)
@@ -138,7 +155,7 @@ def _mixed(x: Tensor) -> Tensor:
 
 def _bits(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
     """Random whole numbers (B, count), which depend on the seed (B,), the stream and the step."""
-    keys = _mixed(_mixed(seed + 0x1E3779B97F4A7C15 * (stream + 1)) + step)
+    keys = _mixed(_mixed(_mixed(seed) + stream) + step)
     index = torch.arange(1, count + 1, device=seed.device)
     return _mixed(keys[:, None] - 0x61C8864680B583EB * index)
 
@@ -146,6 +163,13 @@ def _bits(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
 def uniform(seed: Tensor, stream: int, step: Tensor | int, count: int) -> Tensor:
     """Random numbers (B, count) in [0, 1), float32, of seeds (B,)."""
     return ((_bits(seed, stream, step, count) >> 40) & 0xFFFFFF).float() * 2.0**-24
+
+
+def _chosen(seed: Tensor, stream: int, step: Tensor, share: Tensor, shape: Sequence[int]) -> Tensor:
+    """Random entries (B, *shape), bool, each chosen with the probability ``share`` (B,), rounded to 16 bits."""
+    count = math.prod(shape)
+    numbers = _bits(seed, stream, step, math.ceil(count / 4)).view(torch.int16)[:, :count]  # four from one hash
+    return (numbers < (2.0**16 * share - 2.0**15)[:, None]).view(-1, *shape)
 
 
 def _normal(seed: Tensor, stream: int, step: Tensor, count: int) -> Tensor:
@@ -166,47 +190,45 @@ def draw(conditions: Conditions, seeds: Tensor, action_shape: Sequence[int], lik
         action_shape: (2, R, R).
         like: Gives dtype and device.
     """
-    names = [each.name for each in fields(Conditions) if each.name not in ("chance", "grid")]
-    chosen = uniform(seeds, _CHANCE, 0, len(names)) < conditions.chance
-    numbers = uniform(seeds, _VALUE, 0, len(names) + 3)  # shift and velocity have two axes
+    chosen = uniform(seeds, _CHANCE, 0, len(_NAMES)) < conditions.chance
+    # In float64, in which neither bounds nor whole numbers are rounded; shift and velocity have two axes.
+    numbers = uniform(seeds, _VALUE, 0, len(_NAMES) + 2).double()
     drawn: dict[str, Tensor] = {"seed": seeds}
-    for i, name in enumerate(names):
+    for i, name in enumerate(_NAMES):
         low, high = conditions.bounds(name)
         where, number = chosen[:, i], numbers[:, i]
         if name == "latency":
             drawn[name] = torch.where(where, (low + number * (high - low + 1)).long(), 0)
         elif name in ("shift", "velocity"):
-            two = torch.stack((number, numbers[:, len(names) + (name == "velocity")]), 1)
+            two = torch.stack((number, numbers[:, len(_NAMES) + (name == "velocity")]), 1)
             drawn[name] = torch.where(where[:, None], high * (2.0 * two - 1.0), 0.0).to(like)
         elif name == "turn":
             drawn[name] = torch.where(where, math.radians(high) * (2.0 * number - 1.0), 0.0).to(like)
         else:
             neutral = 1.0 if name in _FACTORS else 0.0
             drawn[name] = torch.where(where, low + number * (high - low), neutral).to(like)
-    steps = conditions.bounds("latency")[1]
-    drawn["pending"] = like.new_zeros(len(seeds), steps, *action_shape)
+    if steps := conditions.bounds("latency")[1]:
+        drawn["pending"] = like.new_zeros(len(seeds), steps, *action_shape)
     return drawn
 
 
-def first_seeds(seeds: Sequence[int | None], device: torch.device) -> Tensor:
-    """Seeds (B,) of episodes: those given; elsewhere arbitrary ones, negated."""
-    arbitrary = np.random.default_rng().integers(1, 2**62, size=len(seeds))
-    host = [-int(other) if seed is None else seed for seed, other in zip(seeds, arbitrary, strict=True)]
-    return to_device(np.array(host, np.int64), device)
-
-
-def next_seeds(drawn: Drawn) -> Tensor:
-    """Seeds (B,) of the episodes that follow without a seed of their own."""
-    return _bits(drawn["seed"], _NEXT, 0, 1)[:, 0] >> 1
+def next_seeds(given: Sequence[int | None], before: Drawn | None, device: torch.device) -> Tensor:
+    """Seeds (B,) of the next episodes: those given; else they follow from the episodes before, or are arbitrary."""
+    seeds = to_device(np.array([-1 if each is None else each for each in given], np.int64), device)
+    if before is None:
+        others = to_device(np.array([secrets.randbits(62) for _ in given], np.int64), device)
+    else:
+        others = _bits(before["seed"], _NEXT, 0, 1)[:, 0] & (2**62 - 1)
+    return torch.where(seeds < 0, others, seeds)
 
 
 def start(drawn: Drawn, positions: Tensor, robot: int) -> Tensor:
     """Initial positions (B, N, 2), m, with the robot, the first particles, turned and shifted, but not lowered."""
     body = positions[:, :robot]
-    centre = body.mean(1, keepdim=True)
-    cos, sin = drawn["turn"].cos(), drawn["turn"].sin()
-    rotation = torch.stack((cos, -sin, sin, cos), 1).view(-1, 2, 2)
-    moved = centre + (body - centre) @ rotation.mT + drawn["shift"][:, None]
+    x, y = (body - body.mean(1, keepdim=True)).unbind(-1)
+    less, sin = drawn["turn"].cos()[:, None] - 1.0, drawn["turn"].sin()[:, None]
+    # Differences, which are exactly 0 in an episode without a turn.
+    moved = body + torch.stack((less * x - sin * y, sin * x + less * y), -1) + drawn["shift"][:, None]
     sunk = (body[..., 1].amin(1) - moved[..., 1].amin(1)).clamp_min(0.0)
     moved = moved + torch.stack((torch.zeros_like(sunk), sunk), 1)[:, None]
     return torch.cat((moved, positions[:, robot:]), 1)
@@ -220,6 +242,29 @@ def physics_of(conditions: Conditions, drawn: Drawn, spec: TaskSpec, physics: Ph
         factor = drawn[name]
         changed[name] = value * (factor if value.ndim == 1 else factor[:, None])
     return {**physics, **changed}
+
+
+def largest_physics(conditions: Conditions, spec: TaskSpec, physics: Physics, like: Tensor) -> Physics:
+    """Constants of the matter with the largest factors, for B simulations."""
+    largest = {name: torch.full_like(like, conditions.bounds(name)[1]) for name in _FACTORS}
+    return physics_of(conditions, largest, spec, physics, like)
+
+
+def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:
+    """Refuse a grid larger than that of the actions, and starts where a task has no room for the robot."""
+    if conditions.grid is not None and conditions.grid > resolution:
+        raise ValueError(f"conditions must have a grid of at most {resolution}, as actions have, got {conditions.grid}")
+    if not (conditions.shift or conditions.turn):
+        return
+    turns, shifts = np.linspace(-conditions.turn, conditions.turn, 9), (-conditions.shift, conditions.shift)
+    numbers = torch.from_numpy(np.array(list(itertools.product(np.radians(turns), shifts, shifts))))
+    points = torch.from_numpy(probe(spec.robot)).expand(len(numbers), -1, -1)
+    for moved in start({"turn": numbers[:, 0], "shift": numbers[:, 1:]}, points, points.shape[1]).numpy():
+        try:
+            check_robot_at(spec, moved, moved.min(0), moved.max(0))
+        except ValueError as error:
+            ranges = f"shift={conditions.shift:g} and turn={conditions.turn:g}"
+            raise ValueError(f"conditions must leave the robot room, got {ranges}, with which {error}") from error
 
 
 def act(conditions: Conditions, drawn: Drawn, steps: Tensor, action: Tensor) -> tuple[Tensor, Drawn]:
@@ -247,8 +292,7 @@ def act(conditions: Conditions, drawn: Drawn, steps: Tensor, action: Tensor) -> 
         noise = noise if grid == size else bicubic(noise, size)
         action = action + drawn["action_noise"][:, None, None, None] * noise
     if conditions.bounds("action_dropout")[1]:
-        numbers = uniform(seed, _ACTION, steps, math.prod(shape)).view(-1, *shape)
-        action = drop(action, numbers < drawn["action_dropout"][:, None, None, None])
+        action = drop(action, _chosen(seed, _ACTION, steps, drawn["action_dropout"], shape))
     return action, drawn
 
 
@@ -263,5 +307,4 @@ def drop(values: Tensor, mask: Tensor) -> Tensor:
 
 def seen(drawn: Drawn, steps: Tensor, image: Tensor) -> Tensor:
     """Images (B, 3, 64, 64) without some of their entries, after ``steps`` (B,) control steps."""
-    numbers = uniform(drawn["seed"], _PIXEL, steps, math.prod(image.shape[1:])).view(image.shape)
-    return image.masked_fill(numbers < drawn["observation_dropout"][:, None, None, None], 0)
+    return drop(image, _chosen(drawn["seed"], _PIXEL, steps, drawn["observation_dropout"], image.shape[1:]))

@@ -45,7 +45,8 @@ class EnvState:
         task_state: What the task remembers.
         physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
         steps: (B,) int64 control steps taken.
-        conditions: Of these episodes, see :class:`dittogym.Conditions`; empty without.
+        conditions: Of these episodes, see :class:`dittogym.Conditions`; empty without. The functions of this module
+            pass them on: only :class:`dittogym.TorchEnv` disturbs actions and images.
     """
 
     particles: ParticleState

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from dittogym.copies import constant
 from dittogym.spec import TaskSpec
-from torchmpm import Body, Elastic, VonMises, checks, tree
+from torchmpm import Body, Elastic, Material, VonMises, checks, tree
 
 #: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -142,7 +143,10 @@ def bodies_of(
     for body, count, weight in zip(spec.bodies, counts, particle_weight, strict=True):
         first, robot = sum(earlier.count for earlier in bodies), not bodies
         own = {name: _part_of(value, slice(first, first + count)) for name, value in values.items()}
-        default = VonMises(own["mu"], own["lam"], own["yield_stress"]) if robot else Elastic(own["mu"], own["lam"])
+        kind, constants = (VonMises, ("mu", "lam", "yield_stress")) if robot else (Elastic, ("mu", "lam"))
+        # Those of a reset were checked there; to check them in every step would wait for a GPU.
+        make: Callable[..., Material] = functools.partial(tree.unchecked, kind) if physics else kind
+        default = make(*(own[name] for name in constants))
         material = default if body.material is None else body.material
         bodies.append(Body(count, material, weight * body.mass * own["mass"], weight, muscle=robot))
     return tuple(bodies)

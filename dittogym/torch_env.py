@@ -130,6 +130,9 @@ class TorchEnv:
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self.conditions = as_conditions(conditions)
+        if self.conditions is not None:
+            varied.check_fit(self.conditions, self.spec, self.action_resolution)
+            self._check_stability({})
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
         self._actuation: Tensor | None = None
@@ -151,6 +154,8 @@ class TorchEnv:
     def env_state(self) -> EnvState:
         """Everything that moves, for :mod:`dittogym.core`. Assign a state to continue from it.
 
+        An environment without conditions leaves those of the state out; one with conditions needs them.
+
         Raises:
             RuntimeError: It was neither reset nor assigned.
         """
@@ -167,12 +172,19 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        if self.conditions is not None and not value.conditions:
-            raise ValueError("env_state must have conditions, as this environment has them, got none")
         if self._env_state is not None and (missing := self._env_state.task_state.keys() - value.task_state.keys()):
             raise ValueError(f"env_state must have the task state of this task, got none of {sorted(missing)}")
-        own_conditions = {} if self.conditions is None else value.conditions
-        self._env_state, self._actuation, self._observation = replace(value, conditions=own_conditions), None, None
+        self._env_state, self._actuation, self._observation = self._with_own_conditions("env_state", value), None, None
+
+    def _with_own_conditions(self, name: str, state: EnvState) -> EnvState:
+        """A state as this environment has it: without conditions where it has none."""
+        if self.conditions is None:
+            return replace(state, conditions={})
+        own = varied.draw(self.conditions, state.steps, self.action_shape, self._like)
+        sizes, expected = ({key: tuple(each.shape[1:]) for key, each in c.items()} for c in (state.conditions, own))
+        if sizes != expected:
+            raise ValueError(f"{name} must be of an environment with such conditions and actions, got another")
+        return state
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
@@ -231,13 +243,14 @@ class TorchEnv:
 
         Raises:
             ValueError: The snapshot is of another task or variant, other numbers of particles, other substeps, another
-                type, device or batch size.
+                type, device or batch size, or without the conditions that this environment has.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs)
         check_snapshot(snapshot, self._constants, self.num_envs)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
-        state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
+        given = self._with_own_conditions("snapshot", snapshot.state)
+        state, observation = tree.map(lambda t: t[index], (given, snapshot.observation))
         actuation = None
         if not chosen.all():
             mine, where = self.env_state, to_device(chosen, self.device)
@@ -259,6 +272,7 @@ class TorchEnv:
         Args:
             seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
+                Conditions are drawn in either case; those of a seed are always the same.
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; ``"physics"``: constants of the matter, see
                 :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
@@ -285,7 +299,7 @@ class TorchEnv:
             check_effect(self.spec, values)
             where = to_device(mask, self.device)
             physics = values if whole else merged(self.spec, physics, values, where, self._like)
-            core.check_stability(self.model, physics)
+            self._check_stability(physics)
         drawn = self._initial_positions.draw(seed, mask, options.get("positions"), self._like)
         index = to_device(np.flatnonzero(mask), self.device)
         conditions, all_physics = self._draw_conditions(seed, physics)
@@ -312,14 +326,23 @@ class TorchEnv:
         """The conditions of the next episodes of all elements, and the constants of the matter in them."""
         if self.conditions is None:
             return {}, physics
-        seeds = varied.first_seeds(self._initial_positions.seeds(seed), self.device)
-        if self._env_state is not None:
-            seeds = torch.where(seeds < 0, varied.next_seeds(self._env_state.conditions), seeds)
-        drawn = varied.draw(self.conditions, seeds.abs(), self.action_shape, self._like)
+        before = None if self._env_state is None else self._env_state.conditions
+        seeds = varied.next_seeds(self._initial_positions.seeds(seed), before, self.device)
+        drawn = varied.draw(self.conditions, seeds, self.action_shape, self._like)
         if self.conditions.changes(self.spec):
             physics = varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
-            core.check_stability(self.model, physics)
         return drawn, physics
+
+    def _check_stability(self, physics: Physics) -> None:
+        """Refuse matter that needs shorter substeps, as it is or with the largest factors of the conditions."""
+        core.check_stability(self.model, physics)
+        if self.conditions is None:
+            return
+        try:
+            core.check_stability(self.model, varied.largest_physics(self.conditions, self.spec, physics, self._like))
+        except ValueError as error:
+            changed = {name: getattr(self.conditions, name) for name in self.conditions.changes(self.spec)}
+            raise ValueError(f"conditions must leave the matter stable, got {changed}, with which {error}") from error
 
     def _begin(self, positions: Tensor, physics: Physics, conditions: Drawn) -> tuple[EnvState, Tensor]:
         """State and observation of new episodes."""
@@ -365,7 +388,8 @@ class TorchEnv:
         checks.flag("soft", soft)
         action, state = self._checked(action), self.env_state
         if self.conditions is not None:
-            action, drawn = varied.act(self.conditions, state.conditions, state.steps, action)
+            drawn = tree.without_inference(state.conditions)
+            action, drawn = varied.act(self.conditions, drawn, state.steps, action)
             state = replace(state, conditions=drawn)
         action = to_grid_layout(action, self.action_layout)
         simulate = core.simulate if self._replayed is None or torch.is_grad_enabled() else self._replayed
@@ -373,14 +397,10 @@ class TorchEnv:
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         info |= {} if result.success is None else {"is_success": result.success}
         info |= {"true_reward": result.true_reward} if soft else {}
-        image, smooth = (
-            None if each is None else self._seen(each, result.state)
-            for each in (result.observation, result.soft_observation)
-        )
-        assert image is not None
+        image, smooth = self._seen(result.observation, result.state), result.soft_observation
         self._observation = image.clone()  # what is returned belongs to the caller
         self._env_state, self._actuation = result.state, result.actuation.detach()
-        observation = image if smooth is None else smooth
+        observation = image if smooth is None else self._seen(smooth, result.state)
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
 
     def _checked(self, action: Tensor) -> Tensor:
@@ -412,7 +432,7 @@ class TorchEnv:
 
     def soft_observation(self) -> Tensor:
         """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
-        return core.soft_observation(self.model, self.env_state)
+        return self._seen(core.soft_observation(self.model, self.env_state), self.env_state)
 
     def shot(self, index: int = 0, quantities: Sequence[str] = QUANTITIES) -> Shot:
         """What pictures show of the present moment of one simulation, ``index``, with these quantities alone."""

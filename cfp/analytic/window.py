@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfp.config import WindowConfig
+from cfp.config import EVALUATION_SEED, WindowConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv, first_limits
 from cfp.errors import ConfigError, NonFiniteError
@@ -167,7 +167,8 @@ class Episodes(Resumable):
     values = ("limit", "returns", "num_started", "counts", "recent_returns")
 
     def __init__(self, env: TorchEnv, seed: int, max_episode_steps: int, num_layouts: int) -> None:
-        self.env, self.num_layouts = env, num_layouts
+        # Conditions follow from the seed as layouts do, so each episode needs a seed of its own.
+        self.env, self.num_layouts = env, num_layouts if env.conditions is None else EVALUATION_SEED - env.num_envs
         count = env.num_envs
         self.first_seed = seed + count
         env.reset(seed=[self.first_seed + i % num_layouts for i in range(count)])

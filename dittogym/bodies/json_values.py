@@ -1,4 +1,4 @@
-"""Bodies and obstacles as values that JSON can hold, for Gymnasium's ``EnvSpec.to_json``."""
+"""Bodies, obstacles and conditions as values that JSON can hold, for Gymnasium's ``EnvSpec.to_json``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
+from dittogym.conditions import Conditions
 from dittogym.geometry import Box, Obstacle
 from dittogym.spec import BodySpec
 from torchmpm import Elastic, Snow, VelocityRule, VonMises
@@ -25,6 +26,10 @@ KINDS: dict[str, Any] = {
 def to_values(value: Any) -> Any:
     """An option of an environment as values for JSON; what JSON can hold already, and unknown objects, as they are."""
     kind = type(value)
+    if isinstance(value, Conditions):
+        return to_values(vars(value))
+    if isinstance(value, dict):
+        return {name: to_values(each) for name, each in value.items()}
     if KINDS.get(kind.__name__) is kind:
         named = {each.name: to_values(getattr(value, each.name)) for each in fields(value)}
         return {"kind": kind.__name__, **named}

@@ -170,6 +170,11 @@ class InitialPositions:
             raise ValueError(f"positions must lie inside the window ({window}), got {where}")
 
 
+def probe(body: BodySpec) -> np.ndarray:
+    """Points (n, 2), m, with which a body is measured."""
+    return body.shape.positions(sampling.sobol(PROBE, seed=0))
+
+
 def check_place(spec: TaskSpec) -> None:
     """Refuse what cannot start where it is.
 
@@ -177,17 +182,11 @@ def check_place(spec: TaskSpec) -> None:
         ValueError: A body leaves the window or overlaps an obstacle, the robot reaches into the bounding box of the
             object or is torn from the start, or the goal lies outside a fixed window.
     """
-    numbers = sampling.sobol(PROBE, seed=0)
-    points = spec.robot.shape.positions(numbers)
+    points = probe(spec.robot)
     origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
-    place = _checked_place(spec, "robot", spec.robot, points, origin)
     for index, other in enumerate(spec.objects):
-        _checked_place(spec, f"objects[{index}]", other, other.shape.positions(numbers), origin)
-        low = np.array(other.shape.corner)
-        high = low + other.shape.size
-        if _any_inside(points, low, high):
-            free = f"{low[0]:.3f} < x < {high[0]:.3f}, {low[1]:.3f} < y < {high[1]:.3f}"
-            raise ValueError(f"robot must leave the place of the object free, {free}, got {place}")
+        _check_body(spec, f"objects[{index}]", probe(other), *_bounds(other), origin)
+    check_robot_at(spec, points, *_bounds(spec.robot))
     split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
     if limit is not None and split >= limit:
         raise ValueError(f"robot must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")
@@ -195,12 +194,29 @@ def check_place(spec: TaskSpec) -> None:
         raise ValueError(f"goal must lie inside the window ({window_range(origin)}), got {spec.goal}")
 
 
-def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray, origin: torch.Tensor) -> str:
-    """Where a body lies, with points (N, 2): inside the window at ``origin`` (1, 2) and outside the obstacles."""
-    (left, bottom), (width, height) = body.shape.corner, body.shape.size
-    place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
-    corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
-    if not bool(contains(corners, origin).all()):
+def check_robot_at(spec: TaskSpec, points: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    """Refuse a robot with these points (n, 2) and corners (2,) outside the window, in an obstacle, or at the object."""
+    origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
+    place = _check_body(spec, "robot", points, low, high, origin)
+    for other in spec.objects:
+        first, last = _bounds(other)
+        if _any_inside(points, first, last):
+            free = f"{first[0]:.3f} < x < {last[0]:.3f}, {first[1]:.3f} < y < {last[1]:.3f}"
+            raise ValueError(f"robot must leave the place of the object free, {free}, got {place}")
+
+
+def _bounds(body: BodySpec) -> tuple[np.ndarray, np.ndarray]:
+    """Lower left and upper right corner (2,) of a body, m."""
+    low = np.array(body.shape.corner)
+    return low, low + body.shape.size
+
+
+def _check_body(
+    spec: TaskSpec, name: str, points: np.ndarray, low: np.ndarray, high: np.ndarray, origin: torch.Tensor
+) -> str:
+    """Where a body lies, with points (n, 2): inside the window at ``origin`` (1, 2) and outside the obstacles."""
+    place = f"{low[0]:.3f} < x < {high[0]:.3f}, {low[1]:.3f} < y < {high[1]:.3f}"
+    if not bool(contains(torch.from_numpy(np.stack((low, high))[None]), origin).all()):
         raise ValueError(f"{name} must lie inside the window ({window_range(origin)}), got {place}")
     for obstacle in spec.obstacles:
         for box in () if obstacle.rules == () else obstacle.boxes:

@@ -286,7 +286,7 @@ def test_a_run_on_the_device_goes_on_to_the_last_bit_there_and_from_arrays(tmp_p
 @pytest.mark.usefixtures("short")
 def test_both_stages_of_a_run_train_on_the_device_and_go_on(tmp_path, monkeypatch):
     make = learner.make_env
-    monkeypatch.setattr(learner, "make_env", lambda *options: make(*options[:-1], True))
+    monkeypatch.setattr(learner, "make_env", lambda *options, **changes: make(*options[:-1], True, **changes))
     assert run(tmp_path / "run", "--steps", "100", "--handover", "0.5") == 0
     assert resume(tmp_path / "run", "--steps", "120") == 0
     rows = read_table(tmp_path / "run" / "progress.csv")

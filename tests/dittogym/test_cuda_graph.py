@@ -56,12 +56,14 @@ def recorded(env: TorchEnv, graph: Any = Imitation) -> TorchEnv:
     return env
 
 
+@pytest.mark.parametrize("conditions", [None, {"latency": 2, "action_noise": 0.1, "velocity": 0.1}])
 @pytest.mark.parametrize("task", TASKS)
 @torch.no_grad()
-def test_a_replay_changes_nothing(task: str) -> None:
+def test_a_replay_changes_nothing(task: str, conditions: Any) -> None:
     """Over resets of some and of all, other physics, and a snapshot."""
     made = Imitation.made
-    pair = recorded(tiny(task, 3, dtype="float32")), tiny(task, 3, dtype="float32")
+    ours, theirs = (tiny(task, 3, dtype="float32", conditions=conditions) for _ in range(2))
+    pair = recorded(ours), theirs
     mask = torch.tensor([False, True, True])
     saved = None
 

@@ -11,6 +11,7 @@ import torch
 from tiny import TASKS, actions, tiny
 
 import dittogym
+from dittogym.conditions import act, seen
 from dittogym.cuda_graph import WARM_UP
 from torchmpm import tree
 
@@ -47,6 +48,49 @@ def test_a_recorded_step_is_the_same(task: str) -> None:
     for given in actions(ours, WARM_UP + 4).to("cuda"):
         assert equal(ours.step(given), theirs.step(given)) and equal(ours.env_state, theirs.env_state)
         assert equal(ours.reset(options={"reset_mask": mask}), theirs.reset(options={"reset_mask": mask}))
+    assert ours._replayed is not None and ours._replayed.failure is None
+
+
+#: Every kind of condition.
+CONDITIONS = {
+    "latency": (0, 2),
+    "action_noise": 0.1,
+    "action_dropout": 0.2,
+    "observation_dropout": 0.2,
+    "mu": (0.8, 1.2),
+    "turn": 5.0,
+    "velocity": 0.1,
+    "grid": 4,
+}
+
+
+def test_conditions_are_those_of_the_cpu() -> None:
+    """Draws agree, and images lose the same entries; the recorded step is the same."""
+    ours = on_cuda("run", conditions=CONDITIONS)
+    cpu = tiny("run", 3, particles=600, dtype="float32", conditions=CONDITIONS)
+    cpu.reset(seed=0)
+    for name, value in cpu.env_state.conditions.items():
+        assert (ours.env_state.conditions[name].cpu() - value).abs().max() <= 1e-6
+    state, image = cpu.env_state.conditions, torch.ones(3, 3, 64, 64)
+    on_device = {name: value.to("cuda") for name, value in state.items()}
+    for step in range(3):
+        steps, action = torch.full((3,), step), actions(cpu, 1, seed=step)[0]
+        assert torch.equal(seen(on_device, steps.to("cuda"), image.to("cuda")).cpu(), seen(state, steps, image))
+        acted, expected = (
+            act(cpu.conditions, each, steps.to(device), action.to(device))[0].cpu()
+            for device, each in (("cuda", on_device), ("cpu", state))
+        )
+        assert (acted - expected).abs().max() <= 1e-5
+
+
+@torch.no_grad()
+def test_a_disturbed_step_is_recorded_and_waits_for_nothing() -> None:
+    ours, theirs = (on_cuda("run", conditions=CONDITIONS) for _ in range(2))
+    theirs._replayed = None
+    for given in actions(ours, WARM_UP + 4).to("cuda"):
+        assert equal(ours.step(given), theirs.step(given)) and equal(ours.env_state, theirs.env_state)
+    with without_waiting():
+        ours.step(given)
     assert ours._replayed is not None and ours._replayed.failure is None
 
 

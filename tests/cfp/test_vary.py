@@ -1,0 +1,101 @@
+"""Trainings whose episodes differ in their conditions, ``--vary``."""
+
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_runs import ONE_STAGE, assert_same_run, at_step, resume, run
+
+import cfp
+from cfp.analytic.window import Episodes
+from cfp.config import EVALUATION_SEED
+from cfp.envs.make import make_torch_env
+from cfp.errors import ConfigError
+from dittogym import TASKS, Conditions, TorchEnv
+
+ONE = {"sac": ONE_STAGE, "analytic": "--resolutions 4 --handover --action-step 0.1 --eval-every 0".split()}
+LEFT = ("progress.csv", "results.json", "policy.safetensors")
+
+
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+@pytest.mark.usefixtures("short")
+def test_a_varied_training_goes_on_as_if_nothing_had_happened(learner, tmp_path):
+    """With actions that are pending; and it is another training than one without."""
+    options = [*ONE[learner], "--steps", "48"]
+    varied = [*options, "--vary", "0.9"]
+    assert run(tmp_path / "whole", *varied, learner=learner) == 0
+    with at_step(24, lambda: signal.raise_signal(signal.SIGINT)):
+        assert run(tmp_path / "stopped", *varied, learner=learner) == 128 + signal.SIGINT
+    assert resume(tmp_path / "stopped") == 0
+    assert_same_run(tmp_path / "stopped", tmp_path / "whole", LEFT)
+    assert run(tmp_path / "other", *options, learner=learner) == 0
+    policies = [(tmp_path / name / "policy.safetensors").read_bytes() for name in ("whole", "other")]
+    assert policies[0] != policies[1]
+
+
+def test_conditions_of_a_run():
+    """Off by default; each range from its option; noise and missing entries on the grid of the stage."""
+    config = cfp.preset("run", "quick", "cfp-analytic")
+    assert config.vary == 0 and config.conditions(1) is None
+    config = replace(config, resolutions=(4, 8), vary=0.5, vary_latency=3, vary_physics=0.1, vary_start=2.0)
+    assert config.conditions(1) == Conditions(
+        latency=(1, 3),
+        action_noise=(0.0, 0.2),
+        action_dropout=(0.0, 0.2),
+        observation_dropout=(0.0, 0.2),
+        mu=(0.9, 1.1),
+        yield_stress=(0.9, 1.1),
+        gravity=(0.9, 1.1),
+        shift=0.02,
+        turn=10.0,
+        velocity=0.1,
+        chance=0.5,
+        grid=4,
+    )
+    assert config.conditions(2) == replace(config.conditions(1), grid=8)
+    assert replace(config, vary_latency=0).conditions(1).latency == (0, 0)
+
+
+@pytest.mark.parametrize("task", tuple(TASKS))
+@pytest.mark.parametrize("algo", ["cfp-analytic", "cfp-sac"])
+def test_every_task_has_room_for_the_default_ranges(task, algo):
+    config = replace(cfp.preset(task, "quick", algo), vary=0.5, device="cpu")
+    config = config.for_training() if algo == "cfp-analytic" else config
+    env = make_torch_env(config, config.action_size(1), conditions=config.conditions(1))
+    assert env.conditions == config.conditions(1)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("vary", 1.5, "vary must be between 0 and 1, got 1.5"),
+        ("vary_latency", -1, "vary_latency must"),
+        ("vary_noise", -0.1, "vary_noise must"),
+        ("vary_actions", 1.1, "vary_actions must be between 0 and 1, got 1.1"),
+        ("vary_pixels", -0.1, "vary_pixels must be between 0 and 1, got -0.1"),
+        ("vary_physics", 1.0, "vary_physics must be at least 0 and less than 1, got 1.0"),
+        ("vary_start", -1.0, "vary_start must"),
+    ],
+)
+def test_ranges_out_of_bounds_are_refused(option, value, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(cfp.preset("run", "quick", "cfp-sac"), **{option: value}).check()
+
+
+def test_learning_by_gradients_draws_conditions_for_each_episode():
+    """Although the layouts of episodes without conditions come again."""
+
+    def seeds(conditions):
+        env, found = TorchEnv("run", 2, particles=100, substeps=1, conditions=conditions), []
+        episodes = Episodes(env, 0, 1, 2)
+        reset = env.reset
+        env.reset = lambda **options: found.extend(options["seed"]) or reset(**options)
+        for _ in range(3):
+            _, reward, terminated, _, info = env.step(torch.zeros(2, 2, 8, 8))
+            episodes.restart(episodes.read(episodes.record(reward, terminated), terminated, info["finite"]))
+        return found
+
+    assert len(set(seeds(None))) == 2
+    varied = seeds({"velocity": 0.1})
+    assert len(set(varied)) == len(varied) == 6 and max(varied) < EVALUATION_SEED
