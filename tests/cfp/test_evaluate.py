@@ -8,7 +8,6 @@ import pytest
 import torch
 from fakes import FakeEnv
 
-from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
@@ -50,10 +49,17 @@ def tiny(task="run", **environment):
 
 
 def fake_trial(policy, episodes, batch=1, **options):
-    def make_env(first, count):
-        return monitored(FakeEnv(count, **{"start": 0.09 * first, "horizon": 4} | options))
+    def make_env(count):
+        return Layouts(count, **{"horizon": 4} | options)
 
     return Trial("", 8, policy, make_env, episodes, deterministic=False, seed=0, batch=batch)
+
+
+class Layouts(FakeEnv):
+    """The height is a tenth of the seed."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=None if seed is None else 10 * seed, options=options)
 
 
 @pytest.fixture
@@ -111,7 +117,11 @@ def test_returns_are_in_the_order_of_layouts(batch):
     policy = Counting()
     result = evaluate([fake_trial(policy, 6, batch, end_above=0.25)])[0]
     assert result.returns == pytest.approx([2.0, 2.4, 2.8, 0.8, 0.9, 1.0])
-    assert result.success == pytest.approx(0.0 + 1 / 6)
+    # The highest one succeeds; like the one below it, it has been torn.
+    assert result.success == pytest.approx(1 / 6) and result.success_whole == 0.0
+    assert result.torn == pytest.approx(2 / 6)
+    assert result.piece == pytest.approx((3 * 1.0 + 3 * 0.8) / 6)
+    assert result.mean_piece == pytest.approx((3 * 0.9 + 3 * 0.8) / 6)
     if batch == 1:
         assert policy.steps == 3 * 4 + 3
 
