@@ -17,8 +17,6 @@ from cfp.evaluation.returns import Played, Result
 from cfp.presets import preset, sac_preset
 from cfp.robustness import DISTURBANCES, choose, effective, ratios
 from dittogym import Conditions, TorchEnv, make_spec
-from dittogym.action import bicubic
-from dittogym.conditions import act, draw, seen
 
 
 def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out():
@@ -166,45 +164,6 @@ def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path
     save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
     config, policies = open_policy(str(tmp_path / "a.safetensors"), "cpu", None)
     assert list(policies) == ["a"] and config.num_envs != there.num_envs
-
-
-# What a policy meets
-
-
-def disturbed(case, steps=6, size=16, grid=4):
-    """What becomes of actions of 0.5 in some steps of 32 episodes, and of white images: (T, 32, ...) each."""
-    conditions, like = Conditions(**DISTURBANCES[case], grid=grid), torch.zeros(1)
-    drawn = draw(conditions, torch.arange(32), (2, size, size), like)
-    actions, images = [], []
-    for step in torch.arange(steps):
-        action, drawn = act(conditions, drawn, step.expand(32), torch.full((32, 2, size, size), 0.5))
-        actions.append(action)
-        images.append(seen(drawn, step.expand(32), torch.full((32, 3, 64, 64), 255, dtype=torch.uint8)))
-    return torch.stack(actions).numpy(), torch.stack(images).numpy()
-
-
-def test_a_fifth_of_the_cells_or_of_the_pixels_is_missing_another_one_in_every_step():
-    actions, images = disturbed("action dropout")
-    assert set(np.unique(actions)) == {0.0, 0.5} and (images == 255).all()
-    cells = actions.reshape(6, 32, 2, 4, 4, 4, 4)
-    assert (cells == cells[:, :, :, :, :1, :, :1]).all()  # whole cells of the policy's own grid
-    assert (actions == 0).mean() == pytest.approx(0.2, abs=0.02)
-    assert not np.array_equal(actions[0], actions[1]) and not np.array_equal(actions[0, 0], actions[0, 1])
-    actions, images = disturbed("observation dropout")
-    assert (actions == 0.5).all() and set(np.unique(images)) == {0, 255}
-    assert (images == 0).mean() == pytest.approx(0.2, abs=0.01) and not np.array_equal(images[0], images[1])
-
-
-def test_noise_is_that_of_the_decisions_enlarged_like_them():
-    fine, coarse = disturbed("action noise")[0], disturbed("action noise", size=4)[0]
-    assert coarse.std() == pytest.approx(0.2, abs=0.01) and coarse.mean() == pytest.approx(0.5, abs=0.01)
-    enlarged = bicubic(torch.from_numpy(coarse).flatten(0, 1), 16).unflatten(0, (6, 32))
-    np.testing.assert_allclose(fine, enlarged.numpy(), atol=1e-6)
-
-
-def test_late_actions_begin_with_none():
-    actions = disturbed("latency")[0]
-    assert (actions[0] == 0.0).all() and (actions[1:] == 0.5).all()
 
 
 # Ratios
