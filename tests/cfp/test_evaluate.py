@@ -12,7 +12,7 @@ from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
-from dittogym import TorchEnv
+from dittogym import Conditions, TorchEnv
 
 
 class LinearPolicy:
@@ -76,10 +76,13 @@ def _ending(step):
     return shortened
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads):
+@pytest.mark.parametrize(
+    ("threads", "conditions"),
+    [(2, None), (3, Conditions(shift=0.01, turn=5.0, velocity=0.05, action_noise=0.2, observation_dropout=0.2))],
+)
+def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads, conditions):
     config, before = tiny(), torch.get_num_threads()
-    options = {"deterministic": False, "seed": 5}
+    options = {"deterministic": False, "seed": 5, "conditions": conditions}
     trial = make_trial(config, "", LinearPolicy(), 4, **options)
     state = torch.get_rng_state()
     try:
@@ -90,9 +93,9 @@ def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(sho
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
-    assert together.returns == alone.returns and len(set(alone.returns)) == 4
-    first, third = (make_trial(config, "", LinearPolicy(), 1, deterministic=False, seed=s) for s in (5, 7))
-    assert [result.returns[0] for result in evaluate([first, third])] == [alone.returns[0], alone.returns[2]]
+    assert together == alone and len(set(alone.returns)) == 4
+    first, third = (make_trial(config, "", LinearPolicy(), 1, **options | {"seed": seed}) for seed in (5, 7))
+    assert [result.episodes[0] for result in evaluate([first, third])] == [alone.episodes[0], alone.episodes[2]]
     assert torch.equal(torch.get_rng_state(), state)
 
 
