@@ -7,6 +7,7 @@ import hashlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -58,6 +59,7 @@ SHOWN = (
     *columns(".0%", success="success", success_whole="and not torn", piece="one piece", mean_piece="over the episode"),
 )
 Row: TypeAlias = dict[str, str]
+Key: TypeAlias = tuple[str, ...]
 Tier: TypeAlias = Literal["full", "lite"]
 
 
@@ -75,7 +77,7 @@ class Command:
     """Run folders, policy files, names of policies that come with the package, or hf://OWNER/NAME."""
     rows: Path | None = None
     """A table of evaluations (.csv) to put the results into. Rows that it has, of the same policy file and as many
-    episodes, are kept, so that an evaluation that was stopped goes on."""
+    episodes, are kept, so that an evaluation that was stopped goes on; those of another file of that name are not."""
     episodes: int = 100
     """Undisturbed episodes with lite particles."""
     full: int = 20
@@ -91,6 +93,8 @@ class Command:
 
     def check(self) -> None:
         """Refuse values that are out of range."""
+        if not self.policies:
+            raise ConfigError("policies must be one or more, got none")
         check_at_least(1, episodes=self.episodes)
         check_at_least(0, full=self.full, disturbed=self.disturbed)
         if self.rows is not None:
@@ -179,26 +183,20 @@ def plan(command: Command, given: str) -> list[Evaluation]:
         (UNDISTURBED, "full", command.full),
         (OWN_START, "full", command.full),
     ]
-    players: list[tuple[Policy, str, str, bool, list[tuple[str, Tier, int]]]] = [
-        (UntrainedPolicy("zero", spec.coarse), "zero", "", True, few),
-        (UntrainedPolicy("random", spec.coarse), "random", "", False, few),
-        (policy, name, sha256, without_noise(policy, command.noise), every),
-    ]
-    found = [
-        Evaluation(config, acting, title, digest, quiet, *case)
-        for acting, title, digest, quiet, cases in players
-        for case in cases
-    ]
+    zero = partial(Evaluation, config, UntrainedPolicy("zero", spec.coarse), "zero", "", True)
+    random = partial(Evaluation, config, UntrainedPolicy("random", spec.coarse), "random", "", False)
+    own = partial(Evaluation, config, policy, name, sha256, without_noise(policy, command.noise))
+    found = [*(make(*case) for make in (zero, random) for case in few), *(own(*case) for case in every)]
     return sorted((each for each in found if each.episodes), key=lambda each: each.particles == "full")
 
 
 # Rows.
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The rows of a table of evaluations; none if there is no such file."""
-    if not path.exists():
-        return []
+def read_rows(path: Path | None) -> dict[Key, Row]:
+    """The rows of a table of evaluations by what tells them apart; none if there is no such file."""
+    if path is None or not path.exists():
+        return {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -207,7 +205,7 @@ def read_rows(path: Path) -> list[Row]:
         raise ConfigError(f"rows: {path} cannot be read ({error})") from error
     if tuple(reader.fieldnames or ()) != COLUMNS:
         raise ConfigError(f"rows: {path} must be a table with the columns {', '.join(COLUMNS)}")
-    return rows
+    return {tuple(row[name] for name in KEY): row for row in rows}
 
 
 def ratios(row: Row, rows: Sequence[Row]) -> tuple[float | None, float | None]:
@@ -245,17 +243,24 @@ def run(command: Command) -> None:
     """Evaluate, put the rows into their table, and print what they say of each policy."""
     command.check()
     plans = [plan(command, given) for given in command.policies]
-    rows = {} if command.rows is None else {tuple(row[name] for name in KEY): row for row in read_rows(command.rows)}
+    rows = read_rows(command.rows)
     for evaluations in plans:
-        keys = []
-        for each in evaluations:
-            keys.append(tuple(each.head[name] for name in KEY))
-            if each.head.items() <= rows.get(keys[-1], {}).items():
+        heads = [each.head for each in evaluations]
+        keys = [tuple(head[name] for name in KEY) for head in heads]
+        for each, head, key in zip(evaluations, heads, keys, strict=True):
+            if head.items() <= rows.get(key, {}).items():
                 continue
-            rows[keys[-1]] = each.play()
+            row = each.play()
+            rows |= read_rows(command.rows)  # to which another program may have added some
+            rows = {other: found for other, found in rows.items() if not _is_of_another_file(found, row)} | {key: row}
             if command.rows is not None:
                 write_text(command.rows, csv_text(rows.values(), COLUMNS))
         print(make_table([rows[key] for key in keys], list(rows.values())).to_markdown(), flush=True)
+
+
+def _is_of_another_file(row: Row, new: Row) -> bool:
+    """Whether a row is about an earlier policy of the same name."""
+    return all(row[name] == new[name] for name in ("task", "policy")) and row["sha256"] != new["sha256"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

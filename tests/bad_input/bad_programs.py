@@ -133,6 +133,7 @@ OTHERS = (
     + rows(
         "disturb",
         ("{folder}", "there is no policy"),
+        ("", "policies must be one or more, got none"),
         ("alchemy", "no shipped one has that name"),
         ("run --cases earthquake", "cases must be words of"),
         ("run --episodes 0", "episodes must be at least 1, got 0"),
