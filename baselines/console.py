@@ -9,7 +9,7 @@ from importlib import import_module
 PROGRAMS = {
     "train": ("cfp.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
     "evaluate": ("cfp.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
-    "robustness": ("cfp.robustness", "returns of a policy in disturbed simulations"),
+    "robustness": ("cfp.robustness", "return, success and robustness of policies"),
     "play": ("cfp.play.__main__", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
     "leaderboard": ("baselines.leaderboard", "evaluate and rank policies under a fixed protocol"),

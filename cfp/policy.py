@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
@@ -95,14 +95,6 @@ class StatePolicy(Protocol):
 
     def attached(self, env: Any) -> Policy:
         """The same policy, acting on the state of a `dittogym.TorchEnv`."""
-
-
-@runtime_checkable
-class DisturbablePolicy(Protocol):
-    """A policy whose decisions are not on an action grid, from which its actions are computed."""
-
-    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
-        """The same policy, with ``change`` applied to its decisions (B, ...) before they become actions."""
 
 
 def check_images(observation: object) -> None:

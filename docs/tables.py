@@ -17,6 +17,7 @@ from typing import Any
 
 import dittogym
 from baselines.compare import paper
+from cfp.robustness import COLUMNS, DISTURBANCES, MATTER, OWN_START, UNDISTURBED, ratios
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Box, Obstacle
 from dittogym.spec import BodySpec
@@ -122,6 +123,68 @@ def results() -> str:
         )
     names = ("zero actions", "random actions", "this package", "success", "paper's CFP", "minutes on one core")
     return markdown(("", *names, "steps, here / in the paper"), rows)
+
+
+#: Cases of the protocol behind each of the six ratios.
+RATIOS = {
+    "missing actions": ("action dropout",),
+    "missing pixels": ("observation dropout",),
+    "latency": ("latency",),
+    "noise": ("action noise",),
+    "matter": tuple(case for case, options in DISTURBANCES.items() if options.keys() & {*MATTER}),
+    "full particles": (UNDISTURBED,),
+}
+
+
+def evaluations(name: str = "evaluations.csv") -> str:
+    """What `torchmpm robustness` has measured of each policy, with ratios (and plain quotients); the paper's CFP."""
+    rows = read(name)
+
+    def found(task: str, policy: str, case: str, particles: str, noise: str = "") -> Row:
+        key = task, policy, case, particles
+        fits = (row for row in rows if (row["task"], row["policy"], row["case"], row["particles"]) == key)
+        return next((row for row in fits if noise in ("", row["noise"])), dict.fromkeys(COLUMNS, ""))
+
+    def mean(row: Row) -> str:
+        return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
+
+    def pair(first: Row, second: Row, column: str) -> str:
+        return " / ".join(f"{float(row[column]):.0%}" if row[column] else "–" for row in (first, second))
+
+    def ratio(cases: Sequence[Row]) -> str:
+        """The lowest ratio of some cases, and its quotient."""
+        pairs = [values for row in cases if row["mean"] and None not in (values := ratios(row, rows))]
+        return "{:.2f} ({:.2f})".format(*min(pairs)) if pairs else ""
+
+    lines = []
+    for task, policy, noise in dict.fromkeys((r["task"], r["policy"], r["noise"]) for r in rows if r["sha256"]):
+        lite, full, own = (
+            found(task, policy, *case, noise)
+            for case in ((UNDISTURBED, "lite"), (UNDISTURBED, "full"), (OWN_START, "full"))
+        )
+        theirs = paper.CURVES[task][0][0] if task in paper.CURVES else None
+        better = theirs is not None and own["interval"] and float(own["mean"]) - float(own["interval"]) > theirs
+        lines.append(
+            [
+                name_of(task) if task in dittogym.TASKS else task,
+                f"`{policy}`" + ", mean action" * (noise == "without"),
+                *(mean(found(task, kind, UNDISTURBED, "lite")) for kind in ("zero", "random")),
+                *(mean(row) for row in (lite, full)),
+                f"**{mean(own)}**" if better else mean(own),
+                f"{theirs:,}" if theirs else "",
+                pair(lite, full, "success"),
+                pair(lite, full, "success_whole"),
+                pair(lite, full, "piece"),
+                *(
+                    ratio(
+                        [found(task, policy, case, "full" if case == UNDISTURBED else "lite", noise) for case in cases]
+                    )
+                    for cases in RATIOS.values()
+                ),
+            ]
+        )
+    heads = ("", "policy", "zero actions", "random actions", "return, lite", "full", "own start", "paper's CFP")
+    return markdown((*heads, "success, lite / full", "and not torn", "one piece", *RATIOS), lines)
 
 
 def planning() -> str:
@@ -415,6 +478,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "costs": costs,
     "csv": from_csv,
     "cuda-kernels": cuda_kernels,
+    "evaluations": evaluations,
     "geometry": geometry,
     "gpu": gpu,
     "gpu-line": gpu_line,

@@ -26,7 +26,6 @@ from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import check_norms, descend
 from cfp.analytic.window import Episodes
 from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
-from cfp.envs import disturbances
 from cfp.envs.make import choose_device, make_env, make_torch_env, seeded
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError, check_at_least, check_fraction, check_positive
 from cfp.experiment.cli import StopSignals
@@ -46,6 +45,7 @@ from cfp.learner import (
 from cfp.policy import copy_policy, load, read_policy, shipped
 from cfp.presets import sac_preset
 from dittogym import TorchEnv, make_spec
+from dittogym.conditions import drop
 from dittogym.spec import DT
 from torchmpm import tree
 
@@ -185,7 +185,7 @@ def drop_entries(values: Tensor, probability: float, grid: int | None = None) ->
         return values
     mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability
     mask &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
-    return disturbances.drop(values, mask.to(values.device))
+    return drop(values, mask.to(values.device))
 
 
 class Collector(Resumable):

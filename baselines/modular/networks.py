@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -123,8 +120,6 @@ class SegmentPolicy(StateBasedPolicy):
         description: What it is and where it comes from, see `cfp.policy.describe_run`.
     """
 
-    change: Callable[[np.ndarray], np.ndarray] | None = None
-
     def __init__(self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None) -> None:
         super().__init__(description)
         self.actor, self.nodes = actor, nodes
@@ -143,12 +138,6 @@ class SegmentPolicy(StateBasedPolicy):
         """Number of features of a node in a task."""
         return self.nodes.num_features(spec)
 
-    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> SegmentPolicy:
-        """Return the same policy, with ``change`` applied to its decisions (B, K, 2) before they reach the grid."""
-        policy = copy.copy(self)
-        policy.change = change
-        return policy
-
     def _act(self, env: TorchEnv, state: Memory, deterministic: bool) -> tuple[Tensor, Memory]:
         """Actions (B, 2, P, P), and the segment of every particle, (B, N)."""
         x, count = visible_positions(env), self.nodes.count
@@ -159,8 +148,6 @@ class SegmentPolicy(StateBasedPolicy):
             labels = segment(x, labels, count, env.env_state.steps == 0)
         device = next(self.actor.parameters()).device
         values = self.actor(self.nodes.observe(env, labels).to(device), deterministic)
-        if self.change is not None:
-            values = torch.from_numpy(self.change(values.cpu().numpy()))
         action = self.nodes.to_grid(env, labels, values.to(env.device))
         return from_grid_layout(action, trained_layout(self) or env.action_layout), (labels.cpu().numpy(),)
 

@@ -42,7 +42,7 @@ RESULTS = (
     *columns(policy="policy", action="action"),
     *columns("d", episodes="episodes"),
     *columns(".1f", mean="mean return", interval="± 95 %", std="std"),
-    *columns(".0%", success="success"),
+    *columns(".0%", success="success", piece="in one piece"),
 )
 
 

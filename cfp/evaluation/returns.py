@@ -9,7 +9,7 @@ which they take their noise, belongs to the whole process.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from threading import Event, Lock
@@ -18,16 +18,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from scipy.special import stdtrit  # scipy.stats takes a second to import
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from cfp.config import EVALUATION_SEED, RunConfig
-from cfp.envs.disturbances import Disturbed
-from cfp.envs.make import choose_device, make_env
-from cfp.envs.vec_env import TorchVecEnv
-from cfp.policy import DisturbablePolicy, Memory, Observation, Policy, Start, StatePolicy
+from cfp.envs.make import choose_device, make_torch_env
+from cfp.envs.vec_env import DIVERGED
+from cfp.errors import NonFiniteError
+from cfp.policy import Memory, Observation, Policy, Start, StatePolicy
+from dittogym import Conditions, TorchEnv
+from dittogym.copies import to_device, to_host
+from dittogym.env import as_numpy
+from dittogym.pieces import largest_piece
 from dittogym.render.recording import seed_noise
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
@@ -81,14 +83,9 @@ class UntrainedPolicy:
 # Playing episodes.
 
 
-def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
-    """A policy for an environment: shown the state if it acts on that, and disturbed where it decides off a grid."""
-    inner = env.unwrapped
-    if isinstance(policy, DisturbablePolicy) and isinstance(env, Disturbed):
-        policy, env.disturbs_actions = policy.through(env.disturb), False
-    if isinstance(policy, StatePolicy) and isinstance(inner, TorchVecEnv):
-        return policy.attached(inner.torch_env)
-    return policy
+def attached(policy: PolicyPredictor, env: TorchEnv) -> PolicyPredictor:
+    """A policy for an environment: shown the state if it acts on that."""
+    return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 
 
 class SeededPolicy:
@@ -127,6 +124,9 @@ class Played(NamedTuple):
 
     total: float  # its undiscounted return
     success: bool | None  # None where the task does not define success
+    torn: bool  # ended by the limit on the robot's spread
+    piece: float  # share of the robot in its largest piece after the last step, see `dittogym.pieces`
+    mean_piece: float  # over the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Trial:
     name: str
     resolution: int  # of the grid on which it decides
     policy: PolicyPredictor
-    make_env: Callable[[int, int], VecEnv]  # from the first layout and the number of layouts
+    make_env: Callable[[int], TorchEnv]  # of a number of simulations
     episodes: int
     deterministic: bool
     seed: int
@@ -150,30 +150,54 @@ class Trial:
 
     def play(self, first: int, count: int, before_step: Callable[[], None]) -> list[Played]:
         """Play the episodes of a span, that of the first layout first."""
-        env = self.make_env(first, count)
-        successes: dict[int, bool | None] = {}
-
-        def note(local: dict[str, Any], _: dict[str, Any]) -> None:
-            if local["done"]:
-                successes[local["i"]] = local["info"].get("is_success")
-
+        env = self.make_env(count)
         acting = SeededPolicy(attached(self.policy, env), first, before_step)
-        env.seed(first)
-        returns, _ = evaluate_policy(
-            acting, env, count, deterministic=self.deterministic, callback=note, return_episode_rewards=True
-        )
-        assert isinstance(returns, list)
-        totals = dict(zip(successes, returns, strict=True))  # both in the order in which the episodes ended
-        return [Played(float(totals[i]), successes[i]) for i in range(count)]
+        with torch.no_grad():
+            observation, _ = env.reset(seed=first)
+        memory, starts = None, np.ones(count, bool)
+        totals = np.zeros(count, np.float32)  # added up as stable-baselines3 does
+        pieces: list[np.ndarray] = []
+        played: dict[int, Played] = {}
+        while len(played) < count:
+            action, memory = acting.predict(as_numpy(observation), memory, starts, deterministic=self.deterministic)
+            if not np.isfinite(action).all():
+                raise NonFiniteError(DIVERGED)
+            with torch.no_grad():
+                observation, *own, info = env.step(to_device(np.array(action, np.float32), env.device))
+            found = dict(zip(("reward", "terminated", "truncated"), own, strict=True))
+            step = to_host(found | {name: info[name] for name in info.keys() & {"split", "is_success"}})
+            totals += step["reward"].astype(np.float32)
+            pieces.append(largest_piece(env.state.x[:, : env.model.num_robot_particles], env.env_state.origin))
+            starts = step["terminated"] | step["truncated"]
+            for i in np.flatnonzero(starts).tolist():
+                if i not in played:
+                    limit = env.spec.split_limit
+                    torn = limit is not None and bool(step["split"][i] > limit)
+                    success = bool(step["is_success"][i]) if "is_success" in step else None
+                    share = [piece[i] for piece in pieces]
+                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)))
+            if starts.any() and len(played) < count:
+                with torch.no_grad():  # so that what has ended stays a robot, and not what is left of one
+                    observation, _ = env.reset(options={"reset_mask": torch.from_numpy(starts)})
+        return [played[i] for i in range(count)]
 
 
-def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, deterministic: bool, seed: int) -> Trial:
-    """Episodes of a policy in the environment of a run."""
+def make_trial(
+    config: RunConfig,
+    name: str,
+    policy: Policy,
+    episodes: int,
+    *,
+    deterministic: bool,
+    seed: int,
+    conditions: Conditions | None = None,
+) -> Trial:
+    """Episodes of a policy in the environment of a run, under conditions if given."""
     return Trial(
         name=name,
         resolution=decision_grid(policy),
         policy=policy,
-        make_env=lambda _, count: make_env(config, policy.resolution, count),
+        make_env=lambda count: make_torch_env(config, policy.resolution, count, conditions=conditions),
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
@@ -242,12 +266,16 @@ def t_interval(values: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class Result:
-    """Undiscounted returns of some episodes of a policy."""
+    """Some episodes of a policy."""
 
     name: str
     resolution: int  # of its action grid
-    returns: tuple[float, ...]  # those of element 0 first, so that equal places are equal layouts
-    success: float | None = None  # share of episodes, None where the task does not define success
+    episodes: tuple[Played, ...]  # in the order of their layouts, so that equal places are equal layouts
+
+    @property
+    def returns(self) -> tuple[float, ...]:
+        """Undiscounted returns."""
+        return tuple(episode.total for episode in self.episodes)
 
     @property
     def mean(self) -> float:
@@ -264,6 +292,36 @@ class Result:
         """Half the width of the 95 % confidence interval of the mean; None for one episode."""
         return t_interval(self.returns)
 
+    @property
+    def success(self) -> float | None:
+        """Share of successful episodes; None where the task does not define success."""
+        return None if self.episodes[0].success is None else _mean(bool(each.success) for each in self.episodes)
+
+    @property
+    def success_whole(self) -> float | None:
+        """Share of the episodes that succeed and are not torn."""
+        defined = self.episodes[0].success is not None
+        return _mean(bool(each.success) and not each.torn for each in self.episodes) if defined else None
+
+    @property
+    def torn(self) -> float:
+        """Share of the episodes that are ended by the limit on the robot's spread."""
+        return _mean(each.torn for each in self.episodes)
+
+    @property
+    def piece(self) -> float:
+        """Share of the robot in one piece after the last step, a mean over the episodes."""
+        return _mean(each.piece for each in self.episodes)
+
+    @property
+    def mean_piece(self) -> float:
+        """The same over all steps."""
+        return _mean(each.mean_piece for each in self.episodes)
+
+
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
+
 
 def evaluate(
     trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
@@ -277,12 +335,8 @@ def evaluate(
         steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
     """
-    results = []
-    for trial, episodes in zip(trials, play(trials, steps, should_stop), strict=True):
-        successes = [episode.success for episode in episodes if episode.success is not None]
-        success = float(np.mean(successes)) if successes else None
-        results.append(Result(trial.name, trial.resolution, tuple(episode.total for episode in episodes), success))
-    return results
+    played = zip(trials, play(trials, steps, should_stop), strict=True)
+    return [Result(trial.name, trial.resolution, tuple(episodes)) for trial, episodes in played]
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
@@ -320,6 +374,10 @@ def numbers(result: Result) -> dict[str, Any]:
         "interval": None if result.interval is None else round(result.interval, 3),
         "returns": [round(value, 3) for value in result.returns],
         "success": result.success,
+        "success_whole": result.success_whole,
+        "torn": result.torn,
+        "piece": round(result.piece, 4),
+        "mean_piece": round(result.mean_piece, 4),
     }
 
 
@@ -334,5 +392,5 @@ def format_table(config: RunConfig, results: Sequence[Result]) -> str:
         spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
         spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
         success = "" if result.success is None else f"   success {result.success:.0%}"
-        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}")
+        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}   in one piece {result.piece:.0%}")
     return "\n".join(lines)

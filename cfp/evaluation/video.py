@@ -10,7 +10,6 @@ import numpy as np
 
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_seed, without_noise
 from cfp.policy import Policy
@@ -35,8 +34,8 @@ def record_episode(
     recorder: Callable[[TorchEnv, Act, int], Recorded],
 ) -> Recorded:
     """One episode of a policy."""
-    venv = TorchVecEnv(make_torch_env(config, policy.resolution, 1))
-    acting, memory, start = SeededPolicy(attached(policy, venv), seed), None, np.array([True])
+    env = make_torch_env(config, policy.resolution, 1)
+    acting, memory, start = SeededPolicy(attached(policy, env), seed), None, np.array([True])
 
     def act(observation: np.ndarray) -> np.ndarray:
         nonlocal memory, start
@@ -44,7 +43,7 @@ def record_episode(
         start = np.array([False])
         return action
 
-    return recorder(venv.torch_env, act, seed)
+    return recorder(env, act, seed)
 
 
 def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) -> None:

@@ -132,13 +132,12 @@ OTHERS = (
     )
     + rows(
         "disturb",
-        ("{folder}", "there is no run"),
-        ("--policy run --out {folder}/new --cases earthquake", "cases must be words of"),
-        ("{folder} --dropout 1.5", "dropout must be above 0 and below 1, got 1.5"),
-        ("{folder} --action-noise nan", "action_noise must be positive"),
-        ("{folder} --friction -1", "friction must be at least 0"),
-        ("--policy run", "out must be given with a single policy"),
-        ("--policy run --out ''", "must name a folder"),
+        ("{folder}", "there is no policy"),
+        ("", "policies must be one or more, got none"),
+        ("alchemy", "no shipped one has that name"),
+        ("run --cases earthquake", "cases must be words of"),
+        ("run --episodes 0", "episodes must be at least 1, got 0"),
+        ("run --rows {folder}", "rows: "),
     )
     + rows(
         "compare",

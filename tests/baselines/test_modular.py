@@ -28,11 +28,8 @@ from baselines.modular.segments import (
     visible_positions,
 )
 from baselines.registry import configure, find
-from cfp.envs.disturbances import Case
-from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import describe_run
-from cfp.robustness import report
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, place, to_grid_layout
 from dittogym.geometry import centre_in_window
@@ -282,17 +279,6 @@ def test_robots_are_segmented_anew_where_their_episode_begins_and_nowhere_else()
     env.reset(options={"reset_mask": torch.tensor([True, False])})
     _, (labels,) = policy.predict(images, memory, np.zeros(2, bool))
     assert np.array_equal(labels[0], first[0]) and (labels[1] == memory[0][1]).mean() > 0.9
-
-
-@pytest.mark.parametrize("case", [Case("lost", action_dropout=0.5), Case("noisy", action_noise=0.3)])
-def test_faults_hit_segments_and_not_the_nodes_that_are_painted_from_them(case, monkeypatch):
-    fields, step = [], TorchVecEnv.step_async
-    monkeypatch.setattr(TorchVecEnv, "step_async", lambda env, actions: fields.append(actions) or step(env, actions))
-    report(replace(config("gnn-16"), task="shapematch"), untrained(deterministic=True), [case], 1)
-    field = np.concatenate(fields)
-    assert len(np.unique(field[0, 0])) <= 16
-    assert (field == 0).mean() == pytest.approx(case.action_dropout, abs=0.1)
-    assert field.std(axis=(2, 3)).mean() > 0.1 * (case.action_noise > 0)
 
 
 def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):

@@ -1,5 +1,6 @@
 """Every algorithm by the command lines and by stable-baselines3, on a robot that moves one substep at a time."""
 
+import csv
 import json
 import signal
 
@@ -16,7 +17,6 @@ from baselines.registry import configure, find, sees
 from cfp import evaluate, robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
-from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.callbacks import EvaluationCallback
 from cfp.policy import StatePolicy, describe_run, read_policy
@@ -142,14 +142,13 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 
 
 @pytest.mark.parametrize("finished", algorithms(slow=set(TINY) - {"cfp-sac", "gradient", "gnn-16"}), indirect=True)
-def test_robustness_is_reported_whatever_trained_it(finished, monkeypatch):
+def test_robustness_is_reported_whatever_trained_it(finished, tmp_path):
     _, folder = finished
-    # Not all of them, which test_robustness.py plays.
-    monkeypatch.setattr("cfp.robustness.make_cases", lambda *options: make_cases(*options)[:4])
-    assert robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 0
-    rows = json.loads((folder / "robustness.json").read_text())
-    assert rows[0]["case"] == "unperturbed" and {row["episodes"] for row in rows} == {1}
-    assert baselines.load(folder).uses_image == any("observation" in row["case"] for row in rows)
+    words = "--episodes 1 --full 0 --disturbed 1 --cases action latency --device cpu".split()
+    assert robustness.main([str(folder), *words, "--rows", str(tmp_path / "rows.csv")]) == 0
+    with (tmp_path / "rows.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["policy"] == folder.name]
+    assert [row["case"] for row in rows] == ["undisturbed", "action dropout", "latency", "action noise"]
 
 
 @pytest.mark.parametrize("finished", ["gradient"], indirect=True)

@@ -12,7 +12,7 @@ import baselines.shac
 from baselines import Shac, StatePolicy
 from baselines.shac import METRICS
 from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
-from cfp.envs.make import make_env
+from cfp.envs.make import make_env, make_torch_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.returns import attached, evaluate, make_trial
 from cfp.policy import describe_run
@@ -164,8 +164,8 @@ def test_policy_goes_through_its_file(tmp_path):
     learner.save_policy(path, describe_run(learner.config, "shac", 1, 8))
     policies = learner.trained_policy, baselines.load(path)
     assert policies[1].description["kind"] == "shac" and policies[1].resolution == 8
-    env = make_env(learner.config, 8, 2)
-    images = env.reset()
+    env = make_torch_env(learner.config, 8, 2)
+    images = env.reset()[0].numpy()
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in policies]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     trials = [make_trial(learner.config, "", each, 2, deterministic=False, seed=3) for each in policies]

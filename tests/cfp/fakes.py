@@ -18,6 +18,18 @@ class FakeState:
     height: Tensor
     steps: Tensor
 
+    @property
+    def x(self):
+        """Particles of a robot that is whole after an even number of steps, and has lost a fifth after an odd one."""
+        whole = torch.tensor([[0.5, 0.5], [0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]]) / 128
+        lost = torch.tensor([[0.1, 0.0], *[[0.0, 0.0]] * 4])
+        return whole + (self.steps % 2)[:, None, None] * lost
+
+    @property
+    def origin(self):
+        """Corners of the windows."""
+        return torch.zeros(len(self.steps), 2)
+
 
 class FakeEnv:
     """Reward 1 - |height - 0.5|; height moves by ``push`` times the mean action.
@@ -33,7 +45,9 @@ class FakeEnv:
     """
 
     def __init__(self, num_envs=2, resolution=8, horizon=5, end_above=10.0, start=0.0, push=0.1, faults=None):
-        self.num_envs, self.action_resolution, self.spec = num_envs, resolution, SimpleNamespace(horizon=horizon)
+        self.num_envs, self.action_resolution = num_envs, resolution
+        self.spec = SimpleNamespace(horizon=horizon, split_limit=1.4)
+        self.model = SimpleNamespace(num_robot_particles=5)
         self.end_above, self.faults, self.device = end_above, faults or {}, torch.device("cpu")
         self.start, self.push = start, push
         self.observation_shape, self.action_shape = (3, 64, 64), (2, resolution, resolution)
@@ -67,10 +81,15 @@ class FakeEnv:
         info = {
             "finite": finite,
             "is_success": height > 0.4,
+            "split": 4 * height,
             "reward_terms": {"near": reward - 1, "alive": reward * 0 + 1},
         }
         terminated, truncated = (height > self.end_above) | ~finite, self.env_state.steps >= self.spec.horizon
         return self._observe(), reward, terminated, truncated, info
+
+    @property
+    def state(self):
+        return self.env_state
 
     def render(self, index=0):
         return np.full((512, 512, 3), index, np.uint8)

@@ -8,12 +8,11 @@ import pytest
 import torch
 from fakes import FakeEnv
 
-from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
-from dittogym import TorchEnv
+from dittogym import Conditions, TorchEnv
 
 
 class LinearPolicy:
@@ -50,10 +49,17 @@ def tiny(task="run", **environment):
 
 
 def fake_trial(policy, episodes, batch=1, **options):
-    def make_env(first, count):
-        return monitored(FakeEnv(count, **{"start": 0.09 * first, "horizon": 4} | options))
+    def make_env(count):
+        return Layouts(count, **{"horizon": 4} | options)
 
     return Trial("", 8, policy, make_env, episodes, deterministic=False, seed=0, batch=batch)
+
+
+class Layouts(FakeEnv):
+    """The height is a tenth of the seed."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=None if seed is None else 10 * seed, options=options)
 
 
 @pytest.fixture
@@ -70,10 +76,13 @@ def _ending(step):
     return shortened
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads):
+@pytest.mark.parametrize(
+    ("threads", "conditions"),
+    [(2, None), (3, Conditions(shift=0.01, turn=5.0, velocity=0.05, action_noise=0.2, observation_dropout=0.2))],
+)
+def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads, conditions):
     config, before = tiny(), torch.get_num_threads()
-    options = {"deterministic": False, "seed": 5}
+    options = {"deterministic": False, "seed": 5, "conditions": conditions}
     trial = make_trial(config, "", LinearPolicy(), 4, **options)
     state = torch.get_rng_state()
     try:
@@ -84,9 +93,9 @@ def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(sho
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
-    assert together.returns == alone.returns and len(set(alone.returns)) == 4
-    first, third = (make_trial(config, "", LinearPolicy(), 1, deterministic=False, seed=s) for s in (5, 7))
-    assert [result.returns[0] for result in evaluate([first, third])] == [alone.returns[0], alone.returns[2]]
+    assert together == alone and len(set(alone.returns)) == 4
+    first, third = (make_trial(config, "", LinearPolicy(), 1, **options | {"seed": seed}) for seed in (5, 7))
+    assert [result.episodes[0] for result in evaluate([first, third])] == [alone.episodes[0], alone.episodes[2]]
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -111,7 +120,11 @@ def test_returns_are_in_the_order_of_layouts(batch):
     policy = Counting()
     result = evaluate([fake_trial(policy, 6, batch, end_above=0.25)])[0]
     assert result.returns == pytest.approx([2.0, 2.4, 2.8, 0.8, 0.9, 1.0])
-    assert result.success == pytest.approx(0.0 + 1 / 6)
+    # The highest one succeeds; like the one below it, it has been torn.
+    assert result.success == pytest.approx(1 / 6) and result.success_whole == 0.0
+    assert result.torn == pytest.approx(2 / 6)
+    assert result.piece == pytest.approx((3 * 1.0 + 3 * 0.8) / 6)
+    assert result.mean_piece == pytest.approx((3 * 0.9 + 3 * 0.8) / 6)
     if batch == 1:
         assert policy.steps == 3 * 4 + 3
 

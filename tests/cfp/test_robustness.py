@@ -1,158 +1,163 @@
-"""The robustness report: what each disturbance does, that it is repeatable, and the command line."""
+"""The evaluation of a policy: what it plays, that its rows are kept and repeatable, and what follows from them."""
 
 import csv
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from fakes import FakeEnv
 from policy_files import save_actor
 from scipy import stats
 
 from cfp import robustness
 from cfp.agent.actor import build_actor
-from cfp.config import to_json
-from cfp.envs.disturbances import Case, Disturbed, changes_something, disturbed_env, make_cases
-from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
-from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.returns import Result
-from cfp.files import write_json
+from cfp.evaluate import open_policy
+from cfp.evaluation.returns import Played, Result
 from cfp.presets import preset, sac_preset
-from dittogym import make_spec
-from dittogym.action import bicubic
-from dittogym.tasks import TASKS
+from cfp.robustness import DISTURBANCES, choose, effective, ratios
+from dittogym import Conditions, TorchEnv, make_spec
 
 
-def disturbed(**disturbance):
-    return Disturbed(monitored(FakeEnv(num_envs=2, horizon=3)), Case("case", **disturbance), seed=0)
+def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out():
+    every = list(DISTURBANCES)
+    assert effective(make_spec("run"), True) == every
+    assert effective(make_spec("shapematch"), True) == [name for name in every if "gravity" not in name]
+    assert "observation dropout" not in effective(make_spec("run"), False)
 
 
-def play(env, actions):
-    """What reached the physics for actions (T, B, 2, R, R), and the first observation."""
-    inner = env.unwrapped.torch_env
-    inner.actions.clear()
-    first = env.reset()
-    for action in actions:
-        env.step(action)
-    return np.stack([action.numpy() for action in inner.actions]), first
-
-
-def test_dropout_zeroes_its_share_of_the_entries_anew_in_every_step():
-    actions = np.full((4, 2, 2, 8, 8), 0.5, np.float32)
-    arrived, _ = play(disturbed(action_dropout=0.2), actions)
-    assert set(np.unique(arrived)) == {0.0, 0.5}
-    assert (arrived == 0).mean() == pytest.approx(0.2, abs=0.04)
-    assert not np.array_equal(arrived[0], arrived[1])
-    env = disturbed(observation_dropout=0.2)
-    _, seen = play(env, actions)
-    whole = play(disturbed(), actions)[1]
-    assert seen.dtype == np.uint8 and (whole[:, 0] > 0).all()
-    assert (seen[:, 0] == 0).mean() == pytest.approx(0.2, abs=0.02)
-    assert (seen[:, 0] == whole[:, 0]).mean() == pytest.approx(0.8, abs=0.02)
-
-
-def test_noise_has_its_deviation_and_every_reset_repeats_it():
-    env = disturbed(action_noise=0.3)
-    actions = np.zeros((4, 2, 2, 8, 8), np.float32)
-    first, _ = play(env, actions)
-    assert first.std() == pytest.approx(0.3, abs=0.02) and first.mean() == pytest.approx(0, abs=0.03)
-    np.testing.assert_array_equal(play(env, actions)[0], first)
-
-
-def test_blended_actions_are_disturbed_on_the_grid_that_they_were_decided_on():
-    env = Disturbed(monitored(FakeEnv(num_envs=2, resolution=16, horizon=3)), Case("case", action_dropout=0.2), 0, 4)
-    arrived, _ = play(env, np.full((4, 2, 2, 16, 16), 0.5, np.float32))
-    cells = arrived.reshape(4, 2, 2, 4, 4, 4, 4).transpose(0, 1, 2, 3, 5, 4, 6).reshape(4, 2, 2, 4, 4, 16)
-    assert (cells == cells[..., :1]).all() and (cells == 0).mean() == pytest.approx(0.2, abs=0.07)
-    shaken = Disturbed(monitored(FakeEnv(num_envs=2, resolution=16, horizon=3)), Case("case", action_noise=0.3), 0, 4)
-    plain = Disturbed(monitored(FakeEnv(num_envs=2, resolution=4, horizon=3)), Case("case", action_noise=0.3), 0)
-    (fine, _), (coarse, _) = (play(e, np.zeros((4, 2, 2, r, r), np.float32)) for e, r in ((shaken, 16), (plain, 4)))
-    np.testing.assert_allclose(fine, bicubic(torch.from_numpy(coarse), 16).numpy(), atol=1e-6)
-
-
-def test_late_actions_stay_in_their_episode():
-    actions = np.arange(1, 6, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 2, 8, 8), np.float32)
-    arrived, _ = play(disturbed(latency=2), actions)  # an episode lasts three steps
-    assert arrived[:, 0, 0, 0, 0].tolist() == [0, 0, 1, 0, 0]
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_constants_reach_the_physics_of_every_task(task):
-    spec, config = make_spec(task), sac_preset(task)
-    config = replace(config, particles=100, substeps=1)
-    env = disturbed_env(config, 8, Case("soft", physics={"mu": 0.5, "yield_stress": 0.5, "gravity": 2.0}), None, 3, 2)
-    env.seed(5)
-    env.reset()
-    physics = env.unwrapped.torch_env.env_state.physics
-    assert physics["mu"].tolist() == [0.5 * spec.mu] * 2
-    assert physics["yield_stress"].tolist() == [0.5 * spec.yield_stress] * 2
-    assert physics["gravity"].tolist() == [[2 * value for value in spec.gravity]] * 2
-    env = disturbed_env(config, 8, Case("ice", friction=0.25), None, 3, 2)
-    floors = [item for item in env.unwrapped.torch_env.spec.obstacles if item.name == "floor"]
-    assert [rule.friction for item in floors for rule in item.velocity_rules] == [0.25]
-    others = [item for item in spec.obstacles if item.name != "floor"]
-    assert [item for item in env.unwrapped.torch_env.spec.obstacles if item.name != "floor"] == others
-
-
-def test_cases_that_change_nothing_in_a_task_are_left_out():
-    cases = make_cases()
-    names = {task: [case.name for case in cases if changes_something(case, make_spec(task))] for task in TASKS}
-    assert "gravity x 0.8" in names["run"] and "gravity x 0.8" not in names["shapematch"]
-    assert "floor friction sticky" in names["dig"] and "floor friction 0" not in names["dig"]
-    assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
+def test_disturbances_are_chosen_by_words():
+    names = effective(make_spec("shapematch"), True)
+    assert choose(names, []) == names
+    assert choose(names, ["dropout", "mu x 0.8"]) == ["action dropout", "observation dropout", "mu x 0.8"]
+    with pytest.raises(ConfigError, match=r"cases must be words of action dropout.*got 'gravity'"):
+        choose(names, ["dropout", "gravity"])
 
 
 def test_interval_is_student_s():
     returns = np.random.default_rng(0).normal(size=5)
     low, high = stats.t.interval(0.95, 4, returns.mean(), stats.sem(returns))
-    assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
-    assert Result("", 8, (1.0,)).interval is None
+    result = Result("", 8, tuple(Played(value, None, False, 1.0, 1.0) for value in returns))
+    assert result.interval == pytest.approx((high - low) / 2, rel=1e-5)
+    assert replace(result, episodes=result.episodes[:1]).interval is None
+
+
+# The command
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The environments that are made, whose episodes last two steps."""
+    envs, init, step = [], TorchEnv.__init__, TorchEnv.step
+
+    def noted(self, *arguments, **options):
+        envs.append(self)
+        init(self, *arguments, **options)
+
+    def shortened(self, action, **options):
+        observation, reward, terminated, truncated, info = step(self, action, **options)
+        return observation, reward, terminated, truncated | (self.env_state.steps >= 2), info
+
+    monkeypatch.setattr(TorchEnv, "__init__", noted)
+    monkeypatch.setattr(TorchEnv, "step", shortened)
+    return envs
 
 
 @pytest.fixture
 def folder(tmp_path):
     config = sac_preset("shapematch")
-    config = replace(config, particles=1000, substeps=2)
-    write_json(tmp_path / "config.json", to_json(config))
-    torch.manual_seed(0)  # of a policy with a positive return, which ratios refer to
-    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
-    return tmp_path
+    torch.manual_seed(0)
+    (tmp_path / "mine").mkdir()
+    save_actor(tmp_path / "mine" / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    return tmp_path / "mine"
 
 
-def test_command_writes_table_and_plot(folder, capsys):
-    arguments = [str(folder), "--episodes", "1", "--device", "cpu"]
-    assert robustness.main(arguments) == 0
-    printed = capsys.readouterr().out
-    rows = json.loads((folder / "robustness.json").read_text())
-    assert [row["case"] for row in rows] == [
-        case.name for case in make_cases() if changes_something(case, make_spec("shapematch"))
-    ]
-    assert rows[0]["ratio"] == 1
+def command(folder, table, words="--episodes 2 --full 0 --disturbed 2"):
+    return robustness.main([str(folder), "--rows", str(table), "--device", "cpu", *words.split()])
+
+
+def rows_of(table):
+    with table.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_case_has_its_starts_disturbance_and_particles(folder, made, tmp_path, capsys):
+    assert command(folder, tmp_path / "rows.csv", "--episodes 1 --full 1 --disturbed 1") == 0
+    rows = rows_of(tmp_path / "rows.csv")
+    own = [row for row in rows if row["policy"] == "mine"]
+    names = effective(make_spec("shapematch"), True)
+    wanted = [("undisturbed", "lite"), *((name, "lite") for name in names)]
+    assert [(row["case"], row["particles"]) for row in own] == [*wanted, ("undisturbed", "full"), ("own start", "full")]
+    assert [row["policy"] for row in rows if row not in own] == ["zero", "random"] * 2
+    starts = {"shift": 0.01, "turn": 5.0, "velocity": 0.05}
+    played = {id(row): env for row, env in zip(rows, made[-len(rows) :], strict=True)}
     for row in rows:
-        assert row["mean"] == pytest.approx(np.mean(row["returns"]), abs=1e-2)
-        assert row["ratio"] == pytest.approx(row["mean"] / rows[0]["mean"], abs=1e-4)
-    assert len({tuple(row["returns"]) for row in rows}) > len(rows) / 2
-    with open(folder / "robustness.csv", newline="") as file:
-        assert [float(row["mean"]) for row in csv.DictReader(file)] == [row["mean"] for row in rows]
-    table = (folder / "robustness.md").read_text()
-    assert table in printed and all(f"| {row['case']} |" in table for row in rows)
-    assert (folder / "robustness.png").read_bytes().startswith(b"\x89PNG")
-    config, policies = open_run(folder, "cpu")
-    again = robustness.report(config, policies["stage 2"], make_cases()[:3], 1)  # alone, with the same seed
-    assert robustness.to_rows(again) == rows[:3]
+        env = played[id(row)]
+        assert env.model.num_robot_particles == {"lite": 2000, "full": 16000}[row["particles"]]
+        if row["case"] == "own start":
+            assert env.conditions is None
+        else:
+            assert env.conditions == Conditions(**starts, **DISTURBANCES.get(row["case"], {}), grid=env.conditions.grid)
+    # The policy enlarges what it decides, and is disturbed before that.
+    sizes = {(played[id(row)].conditions.grid, played[id(row)].action_resolution) for row in own[:-1]}
+    assert sizes == {(32, 64)}
+    assert len({row["mean"] for row in rows}) > len(rows) / 2
+    printed = capsys.readouterr().out
+    assert "mine on shapematch" in printed and all(f"| {name} | lite |" in printed for name in names)
 
 
-def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder, tmp_path, capsys):
-    single = ["--policy", str(folder / "policy.safetensors"), *"--episodes 1 --device cpu --particles 500".split()]
-    assert robustness.main([*single, "--cases", "noise"]) == 2
-    assert "out must be given with a single policy" in capsys.readouterr().err
-    amounts = "--cases noise friction --action-noise 0.3 --friction 0.7".split()
-    assert robustness.main([*single, *amounts, "--out", str(tmp_path / "new")]) == 0
-    table = (tmp_path / "new" / "robustness.md").read_text()
-    assert "particles 500" in table and table.count("\n| ") == 5 and "action noise 0.3" in table
+def test_rows_are_kept_until_the_policy_or_the_number_of_episodes_is_another(folder, made, tmp_path):
+    table, short = tmp_path / "rows.csv", "--cases latency --episodes 2 --full 0 --disturbed 1"
+    assert command(folder, table, short) == 0
+    first, made[:] = table.read_text(), []
+    assert [row["case"] for row in rows_of(table)] == ["undisturbed"] * 3 + ["latency"]
+
+    def played():
+        count, made[:] = len(made), []
+        return count
+
+    assert command(folder, table, short) == 0
+    assert table.read_text() == first and played() == 0
+    assert command(folder, table, short.replace("--episodes 2", "--episodes 3")) == 0
+    assert played() == 3 and len(rows_of(table)) == 4
+    config = sac_preset("shapematch")
+    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 1)
+    assert command(folder, table, short.replace("--episodes 2", "--episodes 3")) == 0
+    assert played() == 3 + 1  # the policy's two rows, and not those of zero and random actions
+    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 2)
+    assert command(folder, table, short.replace("latency", "noise")) == 0
+    own = [row["case"] for row in rows_of(table) if row["policy"] == "mine"]
+    assert own == ["undisturbed", "action noise"]  # nothing is left of the earlier file
+
+
+def test_an_evaluation_that_was_stopped_goes_on_to_the_same_rows(folder, made, tmp_path, monkeypatch):
+    whole, table = tmp_path / "whole.csv", tmp_path / "rows.csv"
+    assert command(folder, whole) == 0
+    play, left = robustness.Evaluation.play, iter(range(5))
+
+    def stopping(evaluation):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return play(evaluation)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(robustness.Evaluation, "play", stopping)
+        assert command(folder, table) == 130
+    assert rows_of(table) == rows_of(whole)[:5]
+    assert command(folder, table) == 0 and table.read_text() == whole.read_text()
+
+
+def test_action_noise_of_the_policy_is_an_option_and_has_rows_of_its_own(folder, made, tmp_path):
+    table, few = tmp_path / "rows.csv", "--cases latency --episodes 1 --full 0 --disturbed 1 --noise "
+    assert command(folder, table, few + "with") == 0 and command(folder, table, few + "without") == 0
+    own = [(row["case"], row["noise"]) for row in rows_of(table) if row["policy"] == "mine"]
+    assert own == [(case, noise) for noise in ("with", "without") for case in ("undisturbed", "latency")]
+
+
+def test_table_must_be_one_of_evaluations(folder, tmp_path, capsys):
+    (tmp_path / "other.csv").write_text("step,mean\n1,2\n")
+    assert command(folder, tmp_path / "other.csv") == 2
+    assert "must be a table with the columns protocol, task" in capsys.readouterr().err
 
 
 def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path):
@@ -163,24 +168,31 @@ def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path
     assert list(policies) == ["a"] and config.num_envs != there.num_envs
 
 
-def test_cases_are_chosen_by_words(folder):
-    run, policy, cases = make_spec("run"), open_run(folder, "cpu")[1]["stage 2"], make_cases()
-    chosen = robustness.choose(cases, ["dropout", "mu x 0.8", "friction"], run, policy)
-    names = ["unperturbed", "action dropout 20%", "observation dropout 20%", "mu x 0.8"]
-    assert [case.name for case in chosen] == names + [f"floor friction {value}" for value in (0, 0.5, "sticky")]
-    assert robustness.choose(cases, [], run, policy) == cases
-    ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
-    with pytest.raises(ConfigError, match="got 'friction'"):
-        robustness.choose(cases, ["friction"], replace(run, obstacles=tuple(ground)), policy)
-    with pytest.raises(ConfigError, match="got 'sticky'"):
-        robustness.choose(cases, ["sticky"], run, policy)
-    policy.uses_image = False
-    with pytest.raises(ConfigError, match="got 'observation'"):
-        robustness.choose(cases, ["observation"], run, policy)
+# Ratios
 
 
-def test_ratios_need_a_positive_return():
-    rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
-    assert [row["ratio"] for row in rows] == [None, None]
-    config = sac_preset("dig")
-    assert "not positive" in robustness.make_table("run", config, rows).description
+def row(policy, case, mean, particles="lite", noise="with"):
+    names = dict.fromkeys(robustness.COLUMNS, "")
+    about = {"protocol": "v2", "task": "run", "policy": policy, "case": case, "particles": particles, "noise": noise}
+    return names | about | {"mean": str(mean), "sha256": "" if policy == "zero" else "abc"}
+
+
+def test_a_ratio_counts_from_zero_actions_with_the_same_particles():
+    noisy = row("mine", "action noise", 60.0)
+    full, own = row("mine", "undisturbed", 90.0, "full"), row("mine", "own start", 95.0, "full")
+    rows = [
+        *(row("zero", "undisturbed", mean, count, "without") for mean, count in ((20.0, "lite"), (10.0, "full"))),
+        *(row("mine", "undisturbed", mean, noise=noise) for mean, noise in ((1000.0, "without"), (100.0, "with"))),
+        row("other", "undisturbed", 7.0),
+        *(noisy, full, own),
+    ]
+    assert ratios(noisy, rows) == pytest.approx((0.5, 0.6))
+    assert ratios(full, rows) == pytest.approx((1.0, 0.9))
+    assert ratios(own, rows) == (None, None)
+
+
+def test_there_is_no_ratio_to_a_policy_that_is_no_better_than_zero_actions():
+    noisy, base = row("mine", "action noise", 5.0), row("mine", "undisturbed", 10.0)
+    assert ratios(noisy, [noisy, base, row("zero", "undisturbed", 20.0, noise="without")]) == (None, 0.5)
+    assert ratios(noisy, [noisy, row("mine", "undisturbed", -10.0)]) == (None, None)
+    assert ratios(noisy, [noisy]) == (None, None)

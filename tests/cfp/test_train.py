@@ -16,7 +16,7 @@ from tiny_runs import OF_LEARNER, ONE_STAGE, TABLES, assert_same_run, at_step, r
 
 from cfp import evaluate, registry
 from cfp.config import to_json
-from cfp.evaluation.returns import Result
+from cfp.evaluation.returns import Played, Result
 from cfp.experiment import callbacks
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.policy import read_policy, write_policy
@@ -71,7 +71,8 @@ def test_the_end_of_a_run_names_an_earlier_stage_that_returns_more(finished, tmp
     folder = shutil.copytree(finished, tmp_path / "run")
 
     def named(**returns):
-        results = [Result(name.replace("_", " "), 4, (value,)) for name, value in returns.items()]
+        episodes = {name.replace("_", " "): (Played(value, None, False, 1.0, 1.0),) for name, value in returns.items()}
+        results = [Result(name, 4, played) for name, played in episodes.items()]
         monkeypatch.setattr("cfp.experiment.run.compare", lambda *_: results)
         assert resume(folder) == 0
         return re.findall(r"(stage .) has the highest mean return", capsys.readouterr().out)

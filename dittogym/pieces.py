@@ -1,0 +1,43 @@
+"""How much of a robot is still in one piece."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+from torch import Tensor
+
+from dittogym.geometry import NODES
+
+#: Cells are neighbours in a plane with their eight around them, and not with those of another robot.
+_NEIGHBOURS = np.stack((np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))))
+
+
+def largest_piece(x: Tensor, origin: Tensor) -> np.ndarray:
+    """Share of the particles, (B,) from 0 to 1, that the largest connected piece of each robot holds.
+
+    A piece consists of cells of the grid, 1/128 m wide, that hold particles. Of these only blocks of 2 x 2 count, so
+    that a strand one cell wide connects nothing and belongs to no piece; cells that touch, be it at a corner, are
+    connected. With fewer than about 2,000 particles robots have holes, and the share means little.
+
+    Args:
+        x: (B, N, 2) positions of the robots' particles, m. Those outside the window, or not finite, are in no piece.
+        origin: (B, 2) lower left corners of the windows, m.
+    """
+    x_cell, y_cell = ((x - origin[:, None]) * NODES).detach().cpu().numpy().transpose(2, 0, 1)
+    robot, particle = np.nonzero((x_cell >= 0) & (x_cell < NODES) & (y_cell >= 0) & (y_cell < NODES))
+    column, row = (cell[robot, particle].astype(np.intp) + 1 for cell in (x_cell, y_cell))
+    full = np.zeros((len(x), NODES + 2, NODES + 2), bool)  # with a margin, so that blocks stay in their window
+    full[robot, column, row] = True
+    corners = full[:, :-1, :-1] & full[:, 1:, :-1] & full[:, :-1, 1:] & full[:, 1:, 1:]  # lower left ones of blocks
+    blocks = np.zeros_like(full)
+    for i, j in np.ndindex(2, 2):
+        blocks[:, i : i + NODES + 1, j : j + NODES + 1] |= corners
+    labels, pieces = ndimage.label(blocks, _NEIGHBOURS)
+    piece = labels[robot, column, row]
+    owner = np.zeros(pieces + 1, np.intp)
+    owner[piece] = robot
+    sizes = np.bincount(piece, minlength=pieces + 1)
+    sizes[0] = 0  # what is in no block
+    largest = np.zeros(len(x), np.intp)
+    np.maximum.at(largest, owner, sizes)
+    return largest / x.shape[1]
