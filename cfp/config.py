@@ -213,6 +213,8 @@ class StagedConfig(RunConfig):
     """paper (the paper's), or small (half the size and width; actions join its features)."""
     history: int = 0
     """Latest actions that the policy sees beside the image."""
+    fill_missing: bool = True
+    """Fill missing pixels (0) from those around them before the policy sees an image."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
     @property
@@ -243,6 +245,7 @@ class StagedConfig(RunConfig):
             patch=None if self.interpolation == "aligned" else make_spec(self.task).patch,
             encoder=self.encoder,
             history=self.history,
+            fill_missing=self.fill_missing,
         )
 
     def check(self) -> None:

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from cfp.agent import history
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
+from cfp.agent.pixels import fill_missing
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
@@ -163,6 +164,8 @@ class ActorPolicy(nn.Module, Shareable):
         check_images(observation)
         assert isinstance(observation, np.ndarray)
         images = observation.reshape(-1, *SHAPE)
+        if self.spec.fill_missing:
+            images = fill_missing(torch.as_tensor(images)).numpy()
         if not (length := self.spec.history):
             action, _ = self.predict_with_gate(images, deterministic)
             return action if observation.ndim == 4 else action[0], state

@@ -33,6 +33,7 @@ PUBLISHED: dict[str, Any] = {
     "num_envs": 1,
     "particles": "full",
     "interpolation": "aligned",
+    "fill_missing": False,
 }
 #: Where the published options of a task differ. Steps and handover are those of the paper's curves. For GROW and CATCH
 #: no second stage was published; the first one's values are used.
@@ -247,6 +248,7 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
         "eval_deterministic": False,
         "interpolation": "half_pixel",
         "encoder": "small",
+        "fill_missing": True,
         "batch_size": 64 if many else 128,
         "learning_rate": 5e-4,
         "gamma": 0.95,

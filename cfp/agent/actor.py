@@ -69,6 +69,7 @@ class ActorSpec:
             the coarser force field only if actions are blended at the size of the environment's patch.
         encoder: ``"paper"`` for the paper's networks, ``"small"`` for the small ones.
         history: Latest actions that the observation contains, see `cfp.agent.history`.
+        fill_missing: Missing pixels of an image are filled from those around them, see `cfp.agent.pixels`.
 
     Raises:
         ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
@@ -83,6 +84,7 @@ class ActorSpec:
     patch: int | None = None
     encoder: EncoderKind = "paper"
     history: int = 0
+    fill_missing: bool = False
 
     def __post_init__(self) -> None:
         """Check that the fields match each other."""

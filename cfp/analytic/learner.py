@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from cfp.agent import history
 from cfp.agent.actor import Actor, build_actor
+from cfp.agent.pixels import fill_missing
 from cfp.analytic.critic import Critic, StateFeatures, check_norms, descend, make_adam, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import AnalyticConfig, of_stage
@@ -220,6 +221,8 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     def observe(self) -> Tensor:
         """What the policy sees now."""
         image = self.simulation.observation()
+        if self.config.fill_missing:
+            image = fill_missing(image)
         if not self.config.history:
             return image
         self.latest_actions = history.clear(self.latest_actions, self.simulation.env_state.steps == 0)
@@ -337,6 +340,12 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             )
         improved = self.action_step(actions, gradients, step_size)
         return torch.cat(images), improved, window
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Act on an ``observation`` by the actor with averaged weights, see `cfp.ActorPolicy.predict`."""
+        return self.trained_policy.predict(observation, state, episode_start, deterministic)
 
     def log_row(self) -> None:
         """Begin the mean return of the next row."""

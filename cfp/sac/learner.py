@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
@@ -28,6 +29,7 @@ from torch.nn import functional as F
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, NetworkInput, upsample
+from cfp.agent.pixels import fill_missing
 from cfp.config import Hyperparameters, Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.envs.vec_env import TorchVecEnv, keeps_tensors
@@ -421,9 +423,8 @@ class CFP(SAC):
         """Act as ``predict`` does, with exploration noise, and keep the parts of the actions; returns tensors."""
         assert self._last_obs is not None
         self.policy.set_training_mode(False)
-        observation: Any = self._last_obs
-        if not self.on_device:
-            observation, _ = self.policy.obs_to_tensor(observation)
+        seen: Any = self._last_obs
+        observation = torch.as_tensor(seen, device=self.device)
         actor = self.networks()[0]
         outputs = actor.outputs(observation)
         if self.noise is not None:
@@ -431,6 +432,27 @@ class CFP(SAC):
             outputs = outputs._replace(mean=outputs.mean + noise)
         sample = actor.act(outputs)
         return sample.action, sample.action if composition is None else composition.join(sample.parts)
+
+    def _prepared(self, observation: Any) -> Any:
+        """Images of the environment as the networks, and the replay memory, get them."""
+        if not (isinstance(self.policy, CFPPolicy) and self.policy.spec.fill_missing):
+            return observation
+        filled = fill_missing(torch.as_tensor(observation))
+        return filled if isinstance(observation, Tensor) else filled.numpy()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        resets = reset_num_timesteps or self._last_obs is None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if resets:
+            self._last_obs = self._prepared(self._last_obs)
+        return result
 
     def _store_transition(
         self,
@@ -442,6 +464,10 @@ class CFP(SAC):
         infos: list[dict[str, Any]],
     ) -> None:
         self._check_finite("reward", reward)
+        new_obs = self._prepared(new_obs)
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = self._prepared(info["terminal_observation"])
         if not self.on_device:
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
             return
