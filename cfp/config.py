@@ -158,6 +158,10 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         """Rows and columns of the actions that the environment of a stage takes."""
         return self.resolution(stage)
 
+    def conditions(self, stage: int) -> Conditions | None:
+        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
+        return None
+
     def evaluation(self, stage: int) -> tuple[int, int]:
         """Seed of the first episode, and number of episodes, of the evaluations during a stage."""
         return self.seed + EVALUATION_SEED, self.eval_episodes
@@ -279,7 +283,8 @@ class StagedConfig(RunConfig):
 class VariationConfig(StagedConfig):
     """Conditions that differ between training episodes (domain randomisation; Tobin et al., IROS 2017).
 
-    Evaluations take place under the task's own conditions.
+    Evaluations in training, which choose the policy, take place under such conditions too, the table at the end under
+    the task's own.
     """
 
     vary: float = 0.0
@@ -298,7 +303,7 @@ class VariationConfig(StagedConfig):
     """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
 
     def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes."""
+        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
         if not self.vary:
             return None
         factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
@@ -495,6 +500,8 @@ class WindowConfig(RunConfig):
     """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
     integrity_weight: float = 300.0
     """Weight of the cost of neighbouring particles that drift apart within a window."""
+    piece_weight: float = 0.0
+    """Weight of the cost of mass that is torn off: the share outside the largest piece, which the critic values."""
     reward_scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
@@ -514,6 +521,7 @@ class WindowConfig(RunConfig):
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
         check_at_least(0, integrity_weight=self.integrity_weight, success_reward=self.success_reward)
+        check_at_least(0, piece_weight=self.piece_weight)
         check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         check_positive(reward_scale=self.reward_scale)

@@ -21,6 +21,7 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv, core
 from dittogym.copies import to_host
+from dittogym.pieces import largest_piece
 from dittogym.rewards import Reward, Transition
 from dittogym.spec import TaskSpec
 from torchmpm import tree
@@ -114,6 +115,9 @@ def training_reward(
         reward = reward - split_cost(info["split"], limit, config.split_margin, config.split_weight)
     if config.integrity_weight:
         reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.num_robot_particles])
+    if config.piece_weight:
+        whole = largest_piece(env.state.x[:, : env.model.num_robot_particles], env.env_state.origin)
+        reward = reward - config.piece_weight * (1.0 - torch.from_numpy(whole).to(reward))
     return config.reward_scale * torch.where(info["finite"], reward, terms["failure"])
 
 

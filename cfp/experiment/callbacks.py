@@ -267,8 +267,15 @@ class EvaluationCallback(StageCallback):
     def _act(self) -> None:
         stage, config = self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
-        deterministic = config.eval_deterministic
-        trial = make_trial(config, "", stage.learner.trained_policy, episodes, deterministic=deterministic, seed=seed)
+        trial = make_trial(
+            config,
+            "",
+            stage.learner.trained_policy,
+            episodes,
+            deterministic=config.eval_deterministic,
+            seed=seed,
+            conditions=config.conditions(stage.number),
+        )
         try:
             result = evaluate([trial], should_stop=lambda: self.signals.number != 0)[0]
         except EpisodesStopped:
