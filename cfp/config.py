@@ -158,8 +158,11 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         """Rows and columns of the actions that the environment of a stage takes."""
         return self.resolution(stage)
 
-    def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
+    def conditions(self, stage: int, progress: float = 1.0) -> Conditions | None:
+        """Conditions of training episodes after a share of a stage; None: the task's own.
+
+        Those of its end are also those of the evaluations that choose the policy.
+        """
         return None
 
     def evaluation(self, stage: int) -> tuple[int, int]:
@@ -215,8 +218,6 @@ class StagedConfig(RunConfig):
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
     """paper (the paper's), or small (half the size and width; actions join its features)."""
-    history: int = 0
-    """Latest actions that the policy sees beside the image."""
     fill_missing: bool = True
     """Fill missing pixels (0) from those around them before the policy sees an image."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
@@ -248,7 +249,6 @@ class StagedConfig(RunConfig):
             interpolation=self.interpolation,
             patch=None if self.interpolation == "aligned" else make_spec(self.task).patch,
             encoder=self.encoder,
-            history=self.history,
             fill_missing=self.fill_missing,
         )
 
@@ -262,7 +262,6 @@ class StagedConfig(RunConfig):
                 raise ConfigError(f"{option.name} must have at least one value")
         self.actor_spec(len(self.resolutions))  # checks the resolutions
         check_at_least(1, steps=self.steps)
-        check_at_least(0, history=self.history)
         check_positive(gate_scale=self.gate_scale)
         if len(self.handover) < (count := len(self.resolutions) - 1):
             raise ConfigError(
@@ -289,6 +288,8 @@ class VariationConfig(StagedConfig):
 
     vary: float = 0.0
     """Probability with which each condition of a training episode is drawn from its range; 0: all are the task's."""
+    vary_from: float = 0.0
+    """Share of each stage after which conditions vary; until then all are the task's."""
     vary_latency: int = 2
     """Control steps by which actions come late, at most."""
     vary_noise: float = 0.2
@@ -302,8 +303,11 @@ class VariationConfig(StagedConfig):
     vary_start: float = 1.0
     """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
 
-    def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
+    def conditions(self, stage: int, progress: float = 1.0) -> Conditions | None:
+        """Conditions of training episodes after a share of a stage; None: the task's own.
+
+        Those of its end are also those of the evaluations that choose the policy.
+        """
         if not self.vary:
             return None
         factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
@@ -318,7 +322,7 @@ class VariationConfig(StagedConfig):
             shift=0.01 * self.vary_start,
             turn=5.0 * self.vary_start,
             velocity=0.05 * self.vary_start,
-            chance=self.vary,
+            chance=self.vary if progress >= self.vary_from else 0.0,
             grid=self.resolution(stage),
         )
 
@@ -327,7 +331,7 @@ class VariationConfig(StagedConfig):
         super().check()
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
-        check_decay(vary_physics=self.vary_physics)
+        check_decay(vary_physics=self.vary_physics, vary_from=self.vary_from)
 
 
 @dataclass(frozen=True, kw_only=True)

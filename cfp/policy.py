@@ -22,7 +22,6 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from cfp.agent import history
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
 from cfp.agent.pixels import fill_missing
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
@@ -150,13 +149,12 @@ class ActorPolicy(nn.Module, Shareable):
 
         Args:
             observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
-            state: What the last call returned, of a policy that sees its latest actions; None at the start.
-            episode_start: (B,) bool, which robots begin an episode.
+            state: Hidden state with leading B, returned as it is: the policy has no memory.
+            episode_start: (B,) bool, without effect.
             deterministic: Act without noise.
 
         Returns:
-            Actions (2, R, R) or (B, 2, R, R) float32, and the ``state`` for the next call: the latest actions
-            (B, H, 2, R, R) in a tuple; as it was given for a policy without memory.
+            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
 
         Raises:
             ValueError: The observation is neither an image nor a batch of images.
@@ -166,17 +164,8 @@ class ActorPolicy(nn.Module, Shareable):
         images = observation.reshape(-1, *SHAPE)
         if self.spec.fill_missing:
             images = fill_missing(torch.as_tensor(images)).numpy()
-        if not (length := self.spec.history):
-            action, _ = self.predict_with_gate(images, deterministic)
-            return action if observation.ndim == 4 else action[0], state
-        shape = (len(images), length, 2, self.resolution, self.resolution)
-        latest = torch.zeros(shape) if state is None else torch.as_tensor(state[0])
-        if episode_start is not None:
-            latest = history.clear(latest, torch.as_tensor(episode_start))
-        seen = history.stack(torch.as_tensor(images), latest)
-        action, _ = self.predict_with_gate(seen.numpy(), deterministic)
-        latest = history.push(latest, torch.from_numpy(action))
-        return action if observation.ndim == 4 else action[0], (latest.numpy(),)
+        action, _ = self.predict_with_gate(images, deterministic)
+        return action if observation.ndim == 4 else action[0], state
 
     @torch.no_grad()
     def predict_with_gate(
@@ -185,7 +174,7 @@ class ActorPolicy(nn.Module, Shareable):
         """Choose actions, and show how the last stage blends them with those of the coarser one.
 
         Args:
-            observation: (B, 3, 64, 64) uint8, with the latest actions if it sees them, see `cfp.agent.history.stack`.
+            observation: (B, 3, 64, 64) uint8.
             deterministic: Act without noise.
 
         Returns:

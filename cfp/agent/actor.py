@@ -20,7 +20,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from cfp.agent.history import channels
 from cfp.errors import ConfigError
 from dittogym.action import bicubic
 from dittogym.geometry import NODES
@@ -68,7 +67,6 @@ class ActorSpec:
             grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
             the coarser force field only if actions are blended at the size of the environment's patch.
         encoder: ``"paper"`` for the paper's networks, ``"small"`` for the small ones.
-        history: Latest actions that the observation contains, see `cfp.agent.history`.
         fill_missing: Missing pixels of an image are filled from those around them, see `cfp.agent.pixels`.
 
     Raises:
@@ -83,7 +81,6 @@ class ActorSpec:
     interpolation: Interpolation = "half_pixel"
     patch: int | None = None
     encoder: EncoderKind = "paper"
-    history: int = 0
     fill_missing: bool = False
 
     def __post_init__(self) -> None:
@@ -232,15 +229,14 @@ def _folded_conv(image: Tensor, weight: Tensor, stride: int) -> Tensor:
 
 
 class PairEncoder(nn.Module):
-    """Encode observation, of which ``history`` latest actions are a part, and action, to a latent (B, 32, 4, 4).
+    """Encode observation and action together, to a latent of (B, 32, 4, 4).
 
     With ``split``, two encoders of half the width are used, for tasks in which the images show different places.
     """
 
-    def __init__(self, split: bool, history: int = 0) -> None:
+    def __init__(self, split: bool) -> None:
         super().__init__()
-        count = channels(history)
-        widths = ((count, 16), (2, 16)) if split else ((count + 2, 32),)
+        widths = ((3, 16), (2, 16)) if split else ((5, 32),)
         self.encoders = nn.ModuleList(Encoder(channels, width) for channels, width in widths)
 
     def forward(self, image: Tensor, patch: Tensor) -> Tensor:
@@ -320,9 +316,9 @@ def halved(image: Tensor) -> Tensor:
 class SmallEncoder(nn.Module):
     """`Encoder` of half the size and width: 2 x 2 pixels are averaged, and features are (B, 16, 4, 4)."""
 
-    def __init__(self, history: int = 0) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.layers = Encoder(channels(history), SMALL_WIDTH, IMAGE_SIZE // 2)
+        self.layers = Encoder(3, SMALL_WIDTH, IMAGE_SIZE // 2)
 
     def forward(self, observation: NetworkInput) -> Tensor:
         """Features of uint8 or `halved` images; those of `Encoded` observations are known."""
@@ -495,7 +491,7 @@ class Actor(SquashedActor):
         super().__init__()
         self.resolution = resolution
         small = spec.encoder == "small"
-        self.encoder: nn.Module = SmallEncoder(spec.history) if small else Encoder(channels(spec.history), 32)
+        self.encoder: nn.Module = SmallEncoder() if small else Encoder(3, 32)
         self.trunk = Trunk() if small else None
         self.mean = make_head(resolution)
         self.std = make_head(resolution)
@@ -567,7 +563,7 @@ class ResidualActor(Actor):
         self.critic_size = spec.critic_size if spec.patch else None
         self.gate_bias, self.gate_scale = gate_bias, spec.gate_scale
         if self.trunk is None:
-            self.encoder = PairEncoder(spec.split, spec.history)
+            self.encoder = PairEncoder(spec.split)
         else:
             self.trunk = Trunk(resolution)
         self.gate = make_head(resolution)

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from cfp.agent import history
 from cfp.agent.actor import Actor, build_actor
 from cfp.agent.pixels import fill_missing
 from cfp.analytic.critic import Critic, StateFeatures, check_norms, descend, make_adam, mlp
@@ -184,7 +183,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     config: AnalyticConfig
     parts = ("regression", "memory", "critic", "collector", "action_step")
-    values = ("generator", "empty_windows", "latest_actions")
+    values = ("generator", "empty_windows")
     presets = ("quick",)
 
     def _setup_model(self) -> None:
@@ -209,9 +208,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         self.collector = WindowCollector(self.simulation, lambda: self.features(self.simulation).float(), config)
         self.action_step = ActionStep()
         self.empty_windows = 0
-        image, size = self.simulation.observation(), config.action_size(self.stage)
-        self._last_obs = image.cpu().numpy()
-        self.latest_actions = torch.zeros(self.n_envs, config.history, 2, size, size, device=self.device)
+        self._last_obs = self.simulation.observation().cpu().numpy()
         seen = self.observe()
         with torch.no_grad():
             outputs = self.actor.outputs(seen, deterministic=True, generator=self.generator)
@@ -221,12 +218,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     def observe(self) -> Tensor:
         """What the policy sees now."""
         image = self.simulation.observation()
-        if self.config.fill_missing:
-            image = fill_missing(image)
-        if not self.config.history:
-            return image
-        self.latest_actions = history.clear(self.latest_actions, self.simulation.env_state.steps == 0)
-        return history.stack(image, self.latest_actions)
+        return fill_missing(image) if self.config.fill_missing else image
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
@@ -236,7 +228,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     @classmethod
     def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> CFPAnalytic:
         """Networks, memory and environment of a stage."""
-        env = make_env(config.for_training(), config.action_size(stage), conditions=config.conditions(stage))
+        env = make_env(config.for_training(), config.action_size(stage), conditions=config.conditions(stage, 0.0))
         learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.actor)
         learner.restart_average()
@@ -317,10 +309,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             with torch.no_grad():
                 outputs = self.actor.outputs(images[-1], generator=self.generator)
                 leaves.append(outputs.location.clamp(-BOUND, BOUND))
-            action = self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
-            if self.config.history:
-                self.latest_actions = history.push(self.latest_actions, action)
-            return action
+            return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
 
         with torch.set_grad_enabled(step_size > 0):
             window = self.collector.collect(act, self.critic, self.after_step)

@@ -54,7 +54,7 @@ def policy_pictures(actor: Actor, observation: Tensor) -> dict[str, np.ndarray]:
     """Pictures, uint8 (H, W, 3), of one observation and what an actor makes of it without noise."""
     sample = actor.sample(observation, deterministic=True)
     pictures = {
-        "picture/observation": _enlarged(observation[0, :3].permute(1, 2, 0).cpu().numpy()),
+        "picture/observation": _enlarged(observation[0].permute(1, 2, 0).cpu().numpy()),
         "picture/action": muscles(sample.action[0]),
     }
     if sample.gate is not None:

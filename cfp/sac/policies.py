@@ -42,9 +42,9 @@ from cfp.policy import check_images
 class PaperCritic(nn.Module):
     """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
-    def __init__(self, split: bool, history: int) -> None:
+    def __init__(self, split: bool) -> None:
         super().__init__()
-        self.encoder = PairEncoder(split, history)
+        self.encoder = PairEncoder(split)
         self.value = perceptron(LATENT, 256, 256, 1)
         initialise(self)
 
@@ -54,10 +54,10 @@ class TwinCritic(nn.Module):
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, resolution: int, split: bool, interpolation: Interpolation, history: int = 0) -> None:
+    def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
         super().__init__()
         self.resolution, self.interpolation = resolution, interpolation
-        self.critics = nn.ModuleList(PaperCritic(split, history) for _ in range(2))
+        self.critics = nn.ModuleList(PaperCritic(split) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         """Values (B, 1) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
@@ -211,7 +211,7 @@ class CFPPolicy(NetworkPolicy):
         spec = self.spec
         if spec.encoder == "small":
             return SmallCritics(spec.critic_size)
-        return TwinCritic(spec.action_size, spec.split, spec.interpolation, spec.history)
+        return TwinCritic(spec.action_size, spec.split, spec.interpolation)
 
     def shared_encoder(self) -> nn.Module | None:
         """The small encoder, which actor and critics share."""

@@ -13,6 +13,7 @@ from cfp.config import EVALUATION_SEED
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from dittogym import TASKS, Conditions, TorchEnv
+from dittogym import conditions as varied
 
 ONE = {"sac": ONE_STAGE, "analytic": "--resolutions 4 --handover --action-step 0.1 --eval-every 0".split()}
 LEFT = ("progress.csv", "results.json", "policy.safetensors")
@@ -55,6 +56,29 @@ def test_conditions_of_a_run():
     )
     assert config.conditions(2) == replace(config.conditions(1), grid=8)
     assert replace(config, vary_latency=0).conditions(1).latency == (0, 0)
+    late = replace(config, vary_from=0.5)
+    assert [late.conditions(1, progress).chance for progress in (0.0, 0.49, 0.5, 1.0)] == [0.0, 0.0, 0.5, 0.5]
+
+
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+@pytest.mark.usefixtures("short")
+def test_conditions_vary_from_a_share_of_the_stage_on(learner, tmp_path, monkeypatch):
+    """Episodes that begin before it have the task's own; a training resumed after it goes on as if nothing happened."""
+    options = [*ONE[learner], "--steps", "48", "--eval-every", "0", "--vary", "1", "--vary-from", "0.5"]
+    drawn = []
+
+    def draw(conditions, *args):
+        drawn.append(conditions.chance)
+        return own(conditions, *args)
+
+    own = varied.draw
+    monkeypatch.setattr(varied, "draw", draw)
+    assert run(tmp_path / "whole", *options, learner=learner) == 0
+    assert {0.0, 1.0} <= set(drawn) and drawn == sorted(drawn)
+    with at_step(36, lambda: signal.raise_signal(signal.SIGINT)):
+        assert run(tmp_path / "stopped", *options, learner=learner) == 128 + signal.SIGINT
+    assert resume(tmp_path / "stopped") == 0
+    assert_same_run(tmp_path / "stopped", tmp_path / "whole", LEFT)
 
 
 @pytest.mark.parametrize("task", tuple(TASKS))
