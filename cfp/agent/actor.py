@@ -109,7 +109,7 @@ class ActorSpec:
         return self.resolutions[-1] if self.encoder == "small" else self.action_size
 
     def filled(self, images: Tensor) -> Tensor:
-        """Images (..., 64, 64) uint8 as the networks get them: with `fill_missing`, missing pixels are filled."""
+        """The ``images`` (..., 64, 64) uint8 as networks get them: missing pixels filled if the structure says so."""
         return fill_missing(images) if self.fill_missing else images
 
 
