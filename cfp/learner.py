@@ -6,7 +6,7 @@ import copy
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -265,8 +265,9 @@ class CoarseToFine(Learner):
             raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
         if policy.spec.encoder != config.encoder:
             raise ConfigError(f"start_from must be a policy with encoder {config.encoder}, got {policy.spec.encoder}")
-        if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
-            raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
+        spec = replace(policy.spec, fill_missing=config.fill_missing)  # it changes no weights
+        if stages > 1 and spec != (allowed_spec := config.actor_spec(stages)):
+            raise ConfigError(f"start_from must have networks {allowed_spec}, got {spec}")
         stage = stages if refine else stages + 1
         copy_policy(config.start_from, start_path(folder) if refine else policy_path(folder, stages))
         return stage, (0, *config.ends())[stage - 1]

@@ -23,7 +23,6 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
-from cfp.agent.pixels import fill_missing
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
@@ -135,7 +134,7 @@ class ActorPolicy(nn.Module, Shareable):
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
         """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``."""
-        action: Tensor = self.actor(observation, deterministic)
+        action: Tensor = self.actor(self.spec.filled(observation), deterministic)
         return action
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -161,10 +160,7 @@ class ActorPolicy(nn.Module, Shareable):
         """
         check_images(observation)
         assert isinstance(observation, np.ndarray)
-        images = observation.reshape(-1, *SHAPE)
-        if self.spec.fill_missing:
-            images = fill_missing(torch.as_tensor(images)).numpy()
-        action, _ = self.predict_with_gate(images, deterministic)
+        action, _ = self.predict_with_gate(observation.reshape(-1, *SHAPE), deterministic)
         return action if observation.ndim == 4 else action[0], state
 
     @torch.no_grad()
@@ -182,7 +178,7 @@ class ActorPolicy(nn.Module, Shareable):
             where the coarser action is kept; ``None`` for a policy of one stage.
         """
         batch = torch.as_tensor(observation, device=next(self.parameters()).device)
-        sample = self.actor.sample(batch, deterministic)
+        sample = self.actor.sample(self.spec.filled(batch), deterministic)
         # This rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space.
         action: np.ndarray = (sample.action.cpu().numpy() + 1) - 1
         return action, None if sample.gate is None else sample.gate.cpu().numpy()

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -325,8 +324,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         learning_rate = config.student_learning_rate * linear_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate
         with self._seeded():
-            student = partial(self.actor, deterministic=not config.student_noise)
-            collected = self.collector.collect(config.rollout_steps, beta, student, self.after_step)
+            collected = self.collector.collect(config.rollout_steps, beta, self._student, self.after_step)
             self._callback.on_rollout_end()
             if collected is None:
                 return False
@@ -344,6 +342,10 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         }
         self.record(self.collector.episodes.scalars() | own)
         return True
+
+    def _student(self, images: Tensor) -> Tensor:
+        action: Tensor = self.actor(self.spec.filled(images), deterministic=not self.config.student_noise)
+        return action
 
     def _on_smaller_grid(self, labels: Labels) -> Labels:
         """Labels on the student's grid where that is smaller: on the whole patch an action is larger than an image."""
@@ -366,7 +368,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         ``observations`` are (B, 3, 64, 64) uint8, the teacher's ``actions`` (B, 2, R, R) on any grid.
         """
         target = project(actions.to(self.simulation.device), self.spec.action_size, self.simulation.spec.patch)
-        return (self.actor(observations.to(self.simulation.device), deterministic=True) - target).square().mean()
+        images = self.spec.filled(observations.to(self.simulation.device))
+        return (self.actor(images, deterministic=True) - target).square().mean()
 
     def _gradient_step(self) -> float:
         labels = self.dataset.sample(self.config.batch_size)
@@ -424,6 +427,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             resolutions=base.resolutions,
             gate_bias=base.gate_bias,
             interpolation=base.interpolation,
+            fill_missing=base.fill_missing,
             split=base.split,
             gate_scale=base.gate_scale,
             student_noise=not base.eval_deterministic,

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from cfp.agent.pixels import fill_missing
 from cfp.errors import ConfigError
 from dittogym.action import bicubic
 from dittogym.geometry import NODES
@@ -106,6 +107,10 @@ class ActorSpec:
     def critic_size(self) -> int:
         """Rows and columns of actions as critics take them: small critics do not need the enlarged action."""
         return self.resolutions[-1] if self.encoder == "small" else self.action_size
+
+    def filled(self, images: Tensor) -> Tensor:
+        """The ``images`` (..., 64, 64) uint8 as networks get them: missing pixels filled if the structure says so."""
+        return fill_missing(images) if self.fill_missing else images
 
 
 # Layers.

@@ -5,15 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Of the nine entries of 3 x 3 pixels around a missing one, how many must be there. Empty space has a density of 0 too:
-#: with five, its border moves by a pixel in corners at most.
+#: Of the nine entries of 3 x 3 pixels around a missing one, how many must be there: with five, borders
+#: of empty space, whose density is 0 too, move by a pixel in corners at most.
 LEAST = 5
 
 
 def fill_missing(image: Tensor) -> Tensor:
     """Images (..., H, W) uint8 whose entries of 0 are the mean of those around them, where enough are not 0.
 
-    A velocity of zero is 132 and a density of zero is 0, so that 0 is either empty space or an entry that got lost.
+    An entry that got lost is 0. So are the density of empty space, and velocities to the left or down that are beyond
+    the range of the image; these come in regions, which stay but for pixels at their corners and single ones.
     """
     values = image.short()  # sums of nine entries fit
     missing = values == 0

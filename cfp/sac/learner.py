@@ -398,7 +398,8 @@ class CFP(SAC):
             return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
         if self.on_device:  # the environment checks the actions
             return self._act(composition)
-        if composition is not None or self.noise is not None:
+        # `predict` would fill the images of `_last_obs`, which are filled, once more.
+        if composition is not None or self.noise is not None or self._fills_images:
             actions, stored = (part.cpu().numpy() for part in self._act(composition))
         else:
             actions, stored = super()._sample_action(0, action_noise, n_envs)
@@ -433,9 +434,13 @@ class CFP(SAC):
         sample = actor.act(outputs)
         return sample.action, sample.action if composition is None else composition.join(sample.parts)
 
+    @property
+    def _fills_images(self) -> bool:
+        return isinstance(self.policy, CFPPolicy) and self.policy.spec.fill_missing
+
     def _prepared(self, observation: Any) -> Any:
         """Images of the environment as the networks, and the replay memory, get them."""
-        if not (isinstance(self.policy, CFPPolicy) and self.policy.spec.fill_missing):
+        if not self._fills_images:
             return observation
         filled = fill_missing(torch.as_tensor(observation))
         return filled if isinstance(observation, Tensor) else filled.numpy()

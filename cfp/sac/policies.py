@@ -35,7 +35,6 @@ from cfp.agent.actor import (
     perceptron,
     upsample,
 )
-from cfp.agent.pixels import fill_missing
 from cfp.policy import check_images
 
 
@@ -229,7 +228,7 @@ class CFPPolicy(NetworkPolicy):
         """The ``observation``, uint8 (3, 64, 64) or (B, 3, 64, 64), as a batch (B, 3, 64, 64), and if it was one."""
         check_images(observation)
         images, batched = super().obs_to_tensor(observation)
-        return fill_missing(cast(Tensor, images)) if self.spec.fill_missing else images, batched
+        return self.spec.filled(cast(Tensor, images)), batched
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ("observation_space", "action_space", "spec", "optimizer_class", "optimizer_kwargs")

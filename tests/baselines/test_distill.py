@@ -10,7 +10,7 @@ from updates import learn
 import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, Shac, train
-from baselines.distillation.learner import METRICS, Collector, Dataset, Labels
+from baselines.distillation.learner import METRICS, Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project
 from baselines.modular import segments as modular_segments
 from baselines.modular.networks import ModularActor, SegmentPolicy
@@ -122,6 +122,16 @@ def test_student_meets_faults_and_labels_do_not():
     assert (blind == 0).float().mean() > (seen == 0).float().mean() + 0.2
     assert not torch.equal(faulty.observations, clean.observations), "lost actions lead elsewhere"
     assert torch.equal(faulty.actions, Mirror().act(student.simulation, faulty.observations))
+
+
+def test_student_learns_from_images_as_its_policy_will_see_them():
+    """With missing pixels filled."""
+    student = make(particles=2000)
+    seen = drop_entries(student.simulation.observation(), 0.5)
+    action, _ = student.trained_policy.predict(seen.numpy(), deterministic=True)
+    loss = student.loss(seen, torch.from_numpy(action) - 0.1)
+    assert loss.item() == pytest.approx(0.01, rel=1e-4)
+    assert student.spec.fill_missing and not torch.equal(student.spec.filled(seen), seen)
 
 
 def test_student_does_as_the_teacher_in_a_closed_loop():

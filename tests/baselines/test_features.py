@@ -10,6 +10,7 @@ from baselines import Shac
 from cfp.analytic.critic import CELLS, StateFeatures
 from cfp.analytic.window import RADIUS, TOLERANCE, Neighbours, training_reward
 from dittogym import TorchEnv
+from dittogym.pieces import largest_piece
 
 
 def reset(task="run", count=500):
@@ -85,3 +86,21 @@ def test_speed_is_what_is_paid_for():
     assert paid(reward="task") == smooth
     lost = smooth - paid(reward="task", split_weight=1000.0, split_margin=0.5)
     assert lost.item() == pytest.approx(1000 * (info["split"].item() / env.spec.split_limit - 0.5) ** 2)
+
+
+def test_torn_off_mass_costs_its_share_in_every_step():
+    env = TorchEnv("run", 2, substeps=1, dtype="float64")
+    env.reset(seed=0)
+    torn = env.state.x[1]
+    torn[torn[:, 0] > torn[:, 0].quantile(0.7), 0] += 0.1
+    neighbours, before = Neighbours.find(env.state.x), env.env_state.centre
+    _, smooth, _, _, info = env.step(torch.zeros(2, 2, 8, 8), soft=True)
+    plain = replace(Shac.preset("run", "quick"), reward="task", split_weight=0.0, integrity_weight=0.0)
+
+    def paid(weight):
+        return training_reward(replace(plain, piece_weight=weight), env, before, smooth, info, neighbours)
+
+    cost = paid(0.0) - paid(20.0)
+    whole, broken = largest_piece(env.state.x, env.env_state.origin)
+    assert whole == 1 and broken == pytest.approx(0.7, abs=0.02)
+    assert cost.tolist() == pytest.approx([0.0, plain.reward_scale * 20 * (1 - broken)])

@@ -1,5 +1,6 @@
 """Trainings whose episodes differ in their conditions, ``--vary``."""
 
+import json
 import signal
 from dataclasses import replace
 
@@ -12,6 +13,9 @@ from cfp.analytic.window import Episodes
 from cfp.config import EVALUATION_SEED
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
+from cfp.evaluation.returns import evaluate, make_trial
+from cfp.registry import configure
+from cfp.tables import read_table
 from dittogym import TASKS, Conditions, TorchEnv
 from dittogym import conditions as varied
 
@@ -81,6 +85,22 @@ def test_conditions_vary_from_a_share_of_the_stage_on(learner, tmp_path, monkeyp
     assert_same_run(tmp_path / "stopped", tmp_path / "whole", LEFT)
 
 
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+@pytest.mark.usefixtures("short")
+def test_policies_are_chosen_under_the_conditions_of_their_training(learner, tmp_path):
+    options = [*ONE[learner], "--steps", "24", "--vary", "1", "--vary-from", "0.9"]
+    assert run(tmp_path, *options, "--eval-every", "24", "--eval-episodes", "2", learner=learner) == 0
+    config, policy = configure(json.loads((tmp_path / "config.json").read_text())), cfp.load(tmp_path)
+
+    def returns(seed, conditions):
+        own = {"deterministic": config.eval_deterministic, "seed": seed, "conditions": conditions}
+        return evaluate([make_trial(config, "", policy, 2, **own)])[0]
+
+    chosen, (seed, _) = read_table(tmp_path / "evaluations.csv"), config.evaluation(1)
+    varied, plain = (returns(seed, conditions) for conditions in (config.conditions(1), None))
+    assert [float(row["mean"]) for row in chosen] == pytest.approx([varied.mean], rel=1e-6) != [plain.mean]
+
+
 @pytest.mark.parametrize("task", tuple(TASKS))
 @pytest.mark.parametrize("algo", ["cfp-analytic", "cfp-sac"])
 def test_every_task_has_room_for_the_default_ranges(task, algo):
@@ -100,6 +120,7 @@ def test_every_task_has_room_for_the_default_ranges(task, algo):
         ("vary_pixels", -0.1, "vary_pixels must be between 0 and 1, got -0.1"),
         ("vary_physics", 1.0, "vary_physics must be at least 0 and less than 1, got 1.0"),
         ("vary_start", -1.0, "vary_start must"),
+        ("vary_from", 1.0, "vary_from must be at least 0 and less than 1, got 1.0"),
     ],
 )
 def test_ranges_out_of_bounds_are_refused(option, value, message):
