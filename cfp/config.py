@@ -158,11 +158,8 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         """Rows and columns of the actions that the environment of a stage takes."""
         return self.resolution(stage)
 
-    def conditions(self, stage: int, progress: float = 1.0) -> Conditions | None:
-        """Conditions of training episodes after a share of a stage; None: the task's own.
-
-        Those of its end are also those of the evaluations that choose the policy.
-        """
+    def conditions(self, stage: int) -> Conditions | None:
+        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
         return None
 
     def evaluation(self, stage: int) -> tuple[int, int]:
@@ -288,8 +285,6 @@ class VariationConfig(StagedConfig):
 
     vary: float = 0.0
     """Probability with which each condition of a training episode is drawn from its range; 0: all are the task's."""
-    vary_from: float = 0.0
-    """Share of each stage after which conditions vary; until then all are the task's."""
     vary_latency: int = 2
     """Control steps by which actions come late, at most."""
     vary_noise: float = 0.2
@@ -303,11 +298,8 @@ class VariationConfig(StagedConfig):
     vary_start: float = 1.0
     """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
 
-    def conditions(self, stage: int, progress: float = 1.0) -> Conditions | None:
-        """Conditions of training episodes after a share of a stage; None: the task's own.
-
-        Those of its end are also those of the evaluations that choose the policy.
-        """
+    def conditions(self, stage: int) -> Conditions | None:
+        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
         if not self.vary:
             return None
         factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
@@ -322,7 +314,7 @@ class VariationConfig(StagedConfig):
             shift=0.01 * self.vary_start,
             turn=5.0 * self.vary_start,
             velocity=0.05 * self.vary_start,
-            chance=self.vary if progress >= self.vary_from else 0.0,
+            chance=self.vary,
             grid=self.resolution(stage),
         )
 
@@ -331,7 +323,7 @@ class VariationConfig(StagedConfig):
         super().check()
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
-        check_decay(vary_physics=self.vary_physics, vary_from=self.vary_from)
+        check_decay(vary_physics=self.vary_physics)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.agent.pixels import fill_missing
 from cfp.analytic.critic import Critic, StateFeatures, check_norms, descend, make_adam, mlp
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import AnalyticConfig, of_stage
@@ -217,8 +216,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def observe(self) -> Tensor:
         """What the policy sees now."""
-        image = self.simulation.observation()
-        return fill_missing(image) if self.config.fill_missing else image
+        return self.config.actor_spec(self.stage).filled(self.simulation.observation())
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
@@ -228,7 +226,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     @classmethod
     def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> CFPAnalytic:
         """Networks, memory and environment of a stage."""
-        env = make_env(config.for_training(), config.action_size(stage), conditions=config.conditions(stage, 0.0))
+        env = make_env(config.for_training(), config.action_size(stage), conditions=config.conditions(stage))
         learner = cls("NetworksPolicy", env, config, stage, choose_device(config.device))
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.actor)
         learner.restart_average()

@@ -175,7 +175,7 @@ class Episodes(Resumable):
         self.env, self.num_layouts = env, num_layouts if env.conditions is None else EVALUATION_SEED - env.num_envs
         count = env.num_envs
         self.first_seed = seed + count
-        env.reset(seed=[self.first_seed + i % num_layouts for i in range(count)])
+        env.reset(seed=[self.first_seed + i % self.num_layouts for i in range(count)])
         self.max_steps = min(max_episode_steps, env.spec.horizon)
         self.limit = first_limits(count, self.max_steps, env.device)
         self.returns = torch.zeros(count, device=env.device)

@@ -185,18 +185,6 @@ class StageCallback(BaseCallback):
         self._on_rollout_start()
 
 
-class ConditionsCallback(StageCallback):
-    """Lets the conditions of training episodes follow the progress of the stage."""
-
-    def __init__(self, stage: Stage) -> None:
-        super().__init__(stage, 0)
-
-    def _on_rollout_start(self) -> None:
-        config, learner = self.stage.config, self.stage.learner
-        progress = learner.num_timesteps / config.stage_steps(learner.stage)
-        self.training_env.set_attr("conditions", config.conditions(learner.stage, progress))
-
-
 class ProgressBarCallback(StageCallback):
     """Shows on the standard error how far the run has come."""
 

@@ -19,7 +19,6 @@ from cfp.evaluation.returns import compare, format_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
     CheckpointCallback,
-    ConditionsCallback,
     EvaluationCallback,
     LogCallback,
     ProgressBarCallback,
@@ -172,7 +171,6 @@ class TrainingRun:
                 evaluation,
                 CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
                 StopCallback(stage, self.signals),
-                *([ConditionsCallback(stage)] if stage.config.conditions(stage.number) else []),
             ]
         )
         try:

@@ -634,7 +634,7 @@ class CFPSAC(SACLearner, CoarseToFine):
     def create(cls, config: SACConfig, stage: int, folder: Path) -> CFPSAC:
         """Networks, replay memory and environment of a stage."""
         tensors = choose_device(config.device) != "cpu"
-        size, conditions = config.action_size(stage), config.conditions(stage, 0.0)
+        size, conditions = config.action_size(stage), config.conditions(stage)
         env = make_env(config, size, None, config.max_episode_steps, tensors, conditions=conditions)
         learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": config.actor_spec(stage)})
         assert isinstance(learner, CFPSAC)

@@ -17,7 +17,6 @@ from cfp.evaluation.returns import evaluate, make_trial
 from cfp.registry import configure
 from cfp.tables import read_table
 from dittogym import TASKS, Conditions, TorchEnv
-from dittogym import conditions as varied
 
 ONE = {"sac": ONE_STAGE, "analytic": "--resolutions 4 --handover --action-step 0.1 --eval-every 0".split()}
 LEFT = ("progress.csv", "results.json", "policy.safetensors")
@@ -60,35 +59,12 @@ def test_conditions_of_a_run():
     )
     assert config.conditions(2) == replace(config.conditions(1), grid=8)
     assert replace(config, vary_latency=0).conditions(1).latency == (0, 0)
-    late = replace(config, vary_from=0.5)
-    assert [late.conditions(1, progress).chance for progress in (0.0, 0.49, 0.5, 1.0)] == [0.0, 0.0, 0.5, 0.5]
-
-
-@pytest.mark.parametrize("learner", ["sac", "analytic"])
-@pytest.mark.usefixtures("short")
-def test_conditions_vary_from_a_share_of_the_stage_on(learner, tmp_path, monkeypatch):
-    """Episodes that begin before it have the task's own; a training resumed after it goes on as if nothing happened."""
-    options = [*ONE[learner], "--steps", "48", "--eval-every", "0", "--vary", "1", "--vary-from", "0.5"]
-    drawn = []
-
-    def draw(conditions, *args):
-        drawn.append(conditions.chance)
-        return own(conditions, *args)
-
-    own = varied.draw
-    monkeypatch.setattr(varied, "draw", draw)
-    assert run(tmp_path / "whole", *options, learner=learner) == 0
-    assert {0.0, 1.0} <= set(drawn) and drawn == sorted(drawn)
-    with at_step(36, lambda: signal.raise_signal(signal.SIGINT)):
-        assert run(tmp_path / "stopped", *options, learner=learner) == 128 + signal.SIGINT
-    assert resume(tmp_path / "stopped") == 0
-    assert_same_run(tmp_path / "stopped", tmp_path / "whole", LEFT)
 
 
 @pytest.mark.parametrize("learner", ["sac", "analytic"])
 @pytest.mark.usefixtures("short")
 def test_policies_are_chosen_under_the_conditions_of_their_training(learner, tmp_path):
-    options = [*ONE[learner], "--steps", "24", "--vary", "1", "--vary-from", "0.9"]
+    options = [*ONE[learner], "--steps", "24", "--vary", "1"]
     assert run(tmp_path, *options, "--eval-every", "24", "--eval-episodes", "2", learner=learner) == 0
     config, policy = configure(json.loads((tmp_path / "config.json").read_text())), cfp.load(tmp_path)
 
@@ -120,7 +96,6 @@ def test_every_task_has_room_for_the_default_ranges(task, algo):
         ("vary_pixels", -0.1, "vary_pixels must be between 0 and 1, got -0.1"),
         ("vary_physics", 1.0, "vary_physics must be at least 0 and less than 1, got 1.0"),
         ("vary_start", -1.0, "vary_start must"),
-        ("vary_from", 1.0, "vary_from must be at least 0 and less than 1, got 1.0"),
     ],
 )
 def test_ranges_out_of_bounds_are_refused(option, value, message):
@@ -144,3 +119,11 @@ def test_learning_by_gradients_draws_conditions_for_each_episode():
     assert len(set(seeds(None))) == 2
     varied = seeds({"velocity": 0.1})
     assert len(set(varied)) == len(varied) == 6 and max(varied) < EVALUATION_SEED
+
+
+def test_first_episodes_differ_in_their_conditions_where_layouts_repeat():
+    env = make_torch_env(
+        replace(cfp.preset("run", "quick", "cfp-analytic"), device="cpu"), 4, 3, conditions=Conditions()
+    )
+    Episodes(env, 0, 10, num_layouts=1)
+    assert len(env.env_state.conditions["seed"].unique()) == 3
