@@ -228,7 +228,11 @@ $("moment").onclick = () => link.send("save", { what: "moment" });
 $("actions").onclick = () => link.send("save", { what: "actions" });
 $("replay").onclick = () => link.send("save", { what: "replay" });
 $("back").onclick = () => link.send("back");
-$("draw").onclick = () => { pad.wipe(); showDialog($("pad")); };
+$("draw").onclick = () => {
+  if (!task) return;
+  pad.wipe();
+  showDialog($("pad"));
+};
 $("help").onclick = () => showDialog($("about"));
 $("close").onclick = () => $("about").close();
 

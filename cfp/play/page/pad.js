@@ -101,7 +101,7 @@ export class Pad {
 
   refuse(message) {
     this.waiting = false;
-    if (this.remedy && this.remedy.tries++ < MOST_TRIES) return this.remedy.apply(), this.use();
+    if (this.remedy?.tries > 0) return this.change();
     if (this.remedy) this.ink.putImageData(this.remedy.drawn, 0, 0);
     this.scale = 1;
     this.remedy = null;
@@ -109,10 +109,15 @@ export class Pad {
     this.show();
   }
 
-  // Change the drawing a little until it is accepted.
-  mend(apply) {
-    this.remedy = { apply, tries: 0, drawn: this.ink.getImageData(0, 0, 256, 256) };
-    apply();
+  // Change the drawing little by little until it is accepted.
+  mend(step) {
+    this.remedy = { step, tries: MOST_TRIES, drawn: this.ink.getImageData(0, 0, 256, 256) };
+    this.change();
+  }
+
+  change() {
+    this.remedy.tries--;
+    this.remedy.step();
     this.use();
   }
 
