@@ -45,6 +45,8 @@ class Command:
     """Seed of the particles."""
     port: int = 0
     """Port of the page; 0: one that is free."""
+    root_path: str = ""
+    """Where a proxy serves the page, such as https://example.org/user/me/proxy/8000."""
     browser: bool = True
     """Open the page in a browser."""
 
@@ -75,7 +77,7 @@ def play(command: Command) -> None:
     try:
         new_session = partial(Session, **options(command))
         new_session()  # what is wrong with the options shows before a page is opened
-        server = Server(new_session, secrets.token_urlsafe(16), command.port)
+        server = Server(new_session, secrets.token_urlsafe(16), command.port, command.root_path)
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
     print(f"Play at {server.address}\nCtrl-C stops the program.", flush=True)

@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchmpm import ParticleState
 
-#: Matter within this distance of the pointer is pulled along, m.
+#: The hand takes hold of the particle nearest to the pointer, at most so far away, and of those as near to that one, m.
 REACH = 0.045
-#: Speed at which matter follows the pointer, per metre of distance to it, 1/s.
-HASTE = 15.0
-#: Largest speed of matter that is pulled, m/s.
-LARGEST_SPEED = 2.0
+#: Angular frequency of the spring between hand and matter, 1/s; it is damped critically.
+SPRING = 20.0
+#: Largest acceleration of held matter, m/s^2; more would tear it off.
+LARGEST_ACCELERATION = 400.0
 #: Smallest distance over which the strength of driven muscles falls off, m.
 MUSCLE_REACH = 0.03
 #: Phase that a wave advances in a control step, and wavelengths in the action image.
@@ -28,32 +29,49 @@ Direction: TypeAlias = Literal["left", "right", "up", "down"]
 class Grip:
     """Particles that are pulled at.
 
-    Their indices (n,), weights (n, 1) from 0 to 1, and the ``offset`` (2,), m, from their weighted centre to the place
-    at which they are held.
+    Attributes:
+        indices: (n,) of the particles held.
+        weights: (n, 1), from 0 to 1.
+        offset: (2,), m, from their weighted centre to the place at which they are held.
+        hanging: Indices of the particles that move along: all of the robot, or of other matter only what is held.
     """
 
     indices: Tensor
     weights: Tensor
     offset: Tensor
+    hanging: Tensor
 
     @classmethod
-    def take(cls, state: ParticleState, point: Tensor) -> Grip | None:
-        """Take hold of the particles around a point (2,) of the world, m; ``None`` where there are none."""
-        x = state.x[0]
-        distance = (x - point).norm(dim=1)
-        indices = (distance < REACH).nonzero()[:, 0]  # never those that are not finite
-        if not len(indices):
-            return None
-        weights = 1.0 - (distance[indices, None] / REACH).square()
-        return cls(indices, weights, point - (weights * x[indices]).sum(0) / weights.sum())
+    def take(cls, state: ParticleState, point: Tensor, num_robot: int) -> Grip | None:
+        """Take hold of matter at a point (2,) of the world, m; ``None`` where there is none.
 
-    def pull(self, state: ParticleState, point: Tensor) -> ParticleState:
-        """Give the particles a velocity with which the place they are held at goes to a point (2,), m."""
+        What is held is around the particle that is nearest to the point: of the robot, the first ``num_robot``
+        particles, or of everything else.
+        """
+        x = state.x[0]
+        distance = (x - point).norm(dim=1).nan_to_num(torch.inf)
+        nearest = int(distance.argmin())
+        if distance[nearest] > REACH:
+            return None
+        distance = (x - x[nearest]).norm(dim=1)  # so that there is enough to hold at an edge, too
+        of_robot = torch.arange(len(x), device=x.device) < num_robot
+        indices = ((distance < REACH) & (of_robot == of_robot[nearest])).nonzero()[:, 0]
+        weights = 1.0 - (distance[indices, None] / REACH).square()
+        hanging = of_robot.nonzero()[:, 0] if nearest < num_robot else indices
+        return cls(indices, weights, point - (weights * x[indices]).sum(0) / weights.sum(), hanging)
+
+    def pull(self, state: ParticleState, point: Tensor, duration: float) -> ParticleState:
+        """Let a spring to a point (2,), m, act for a ``duration``, s, on the place at which the particles are held.
+
+        Only held particles feel it, but it is as strong as moving everything that hangs on them needs.
+        """
         held = (self.weights * state.x[0, self.indices]).sum(0) / self.weights.sum() + self.offset
-        velocity = HASTE * (point - held)
-        velocity = velocity * (LARGEST_SPEED / velocity.norm().clamp_min(LARGEST_SPEED))
+        speed = state.v[0, self.hanging].mean(0)
+        acceleration = SPRING**2 * (point - held) - 2 * SPRING * speed
+        acceleration = acceleration * (len(self.hanging) / self.weights.sum())
+        acceleration = acceleration * (LARGEST_ACCELERATION / acceleration.norm().clamp_min(LARGEST_ACCELERATION))
         v = state.v.clone()
-        v[0, self.indices] += self.weights * (velocity - v[0, self.indices])
+        v[0, self.indices] += duration * self.weights * acceleration
         return replace(state, v=v)
 
 

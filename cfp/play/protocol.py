@@ -109,10 +109,14 @@ class Back(Message, frozen=True):
 
 
 class Draw(Message, frozen=True):
-    """A drawn robot or target: a square picture, one byte per pixel, row 0 at the top."""
+    """A drawn robot or target: a square picture, one byte per pixel, row 0 at the top.
+
+    A robot has the area of the task's own one, or with a ``scale`` less than 1 so many times its width and height.
+    """
 
     what: Literal["body", "target"]
     pixels: Pixels
+    scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
 
 
 class Seen(Message, frozen=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import secrets
 import socket
 import time
@@ -12,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import torch
 import uvicorn
@@ -21,7 +23,7 @@ from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cfp.play import protocol
@@ -56,18 +58,31 @@ class Server:
         new_session: Makes the simulation of a page that was opened.
         token: Must be in the address of the page.
         port: Of 127.0.0.1; 0: one that is free.
+        root_path: The address at which a proxy serves the page, ``"https://example.org/user/me/proxy/8000"``, or its
+            path alone if the proxy passes on the host that the browser asked for. The proxy may take the path away.
 
     Raises:
         OSError: The port is taken.
-        ValueError: There is no such port.
+        ValueError: There is no such port, or ``root_path`` is neither an address nor a path.
     """
 
-    def __init__(self, new_session: Callable[[], Session], token: str, port: int) -> None:
+    def __init__(self, new_session: Callable[[], Session], token: str, port: int, root_path: str = "") -> None:
         self.new_session, self.token = new_session, token
         self.connections: set[Connection] = set()
-        routes = [Route("/", self.page), Route("/page/{name}", self.file), WebSocketRoute("/ws", self.play)]
+        if (found := re.fullmatch(r"(https?://[^/?#]+)?((?:/[^/?#]+)*)/?", root_path)) is None:
+            raise ValueError(f"root_path must be a path or an address that begins with http, got {root_path!r}")
+        #: The address of the proxy, from whose pages alone connections come then, as browsers write it; and the prefix.
+        self.proxy, self.prefix = found[1] and found[1].lower(), found[2]
+        routes: list[BaseRoute] = [
+            Route("/", self.page),
+            Route("/page/{name}", self.file),
+            WebSocketRoute("/ws", self.play),
+        ]
+        if self.prefix:
+            routes.append(Mount(self.prefix, routes=routes.copy()))
         # Not under other names of this machine.
-        app = Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)])
+        hosts = HOSTS if self.proxy is None else [*HOSTS, str(urlsplit(self.proxy).hostname)]
+        app = Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=hosts)])
         self._socket = socket.create_server((HOSTS[0], checks.whole("port", port, 0, 65535)))
         self.port: int = self._socket.getsockname()[1]
         options: dict[str, Any] = {"log_level": "warning", "ws_max_size": protocol.LARGEST_MESSAGE, "lifespan": "off"}
@@ -76,7 +91,7 @@ class Server:
     @property
     def address(self) -> str:
         """Address of the page, with the token."""
-        return f"http://{HOSTS[0]}:{self.port}/?token={self.token}"
+        return f"{self.proxy or f'http://{HOSTS[0]}:{self.port}'}{self.prefix}/?token={self.token}"
 
     def run(self) -> None:
         """Serve until Ctrl-C, or until :meth:`stop` is called in another thread."""
@@ -101,7 +116,7 @@ class Server:
 
     async def play(self, websocket: WebSocket) -> None:
         """Play with a page until it is closed."""
-        if not has_token(websocket.query_params, self.token) or not own_origin(websocket.headers):
+        if not has_token(websocket.query_params, self.token) or not self.own_origin(websocket.headers):
             await websocket.close(1008)  # it was not accepted yet: the status is 403
             return
         await websocket.accept()
@@ -117,15 +132,17 @@ class Server:
         finally:
             self.connections.discard(connection)
 
+    def own_origin(self, headers: Headers) -> bool:
+        """Whether a WebSocket was opened by a page of this server: browsers let those of any server open one."""
+        origin, own = headers.get("origin"), self.proxy or f"http://{headers.get('host')}"
+        if origin != own:
+            log.warning("refused a page of %s; if that is your proxy: --root-path %s%s", origin, origin, self.prefix)
+        return origin == own
+
 
 def has_token(query: QueryParams, token: str) -> bool:
     """Whether a request has the token."""
     return secrets.compare_digest(query.get("token", "").encode(), token.encode())
-
-
-def own_origin(headers: Headers) -> bool:
-    """Whether a WebSocket was opened by a page of this server: browsers let those of any server open one."""
-    return headers.get("origin") == f"http://{headers.get('host')}"
 
 
 class Connection:

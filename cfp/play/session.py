@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,13 +18,17 @@ from torch import Tensor
 from cfp.play import protocol
 from cfp.play.hand import Direction, Grip, press, reach, wave
 from dittogym.action import bicubic, from_grid_layout, patch_corner, to_grid_layout, trained_layout
+from dittogym.bodies.drawings import with_body
+from dittogym.bodies.positions import probe
+from dittogym.bodies.shapes import Figure
 from dittogym.core import check_stability
 from dittogym.geometry import NODES, centre_in_window
 from dittogym.physics import check_effect, physics_values
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
 from dittogym.snapshots import Snapshot
-from dittogym.tasks import TASKS, headline, task_name
+from dittogym.spec import BodySpec
+from dittogym.tasks import TASKS, headline, make_spec, task_name
 from dittogym.torch_env import TorchEnv
 
 #: Names of the bits of a frame's flags.
@@ -86,7 +91,6 @@ class Session:
     history: History
     shot: Shot
     grip: Grip | None
-    terms: Mapping[str, Tensor]
     direction: Direction | None = None
     policy: Any = None
     policy_name: str | None = None
@@ -102,12 +106,16 @@ class Session:
     ) -> None:
         self.task, self.seed, self.options = task, seed, dict(action_layout="image", **options)  # that of the page
         self.policies, self.env = dict(policies or {}), TorchEnv(task, 1, **self.options)
+        task_options = self.options.keys() & inspect.signature(TASKS[task_name(task)]).parameters.keys()
+        #: The task with its own robot.
+        self.own_spec = make_spec(task, **{name: self.options[name] for name in task_options})
         self.own_resolution = self.env.action_resolution
         self.control_step = self.env.model.substeps * self.env.model.solver.dt
         self.playing, self.speed = True, 0.1 if self.env.spec.horizon * self.control_step < SHORT else 1.0
         self.colour = "deformation" if policy is None else "muscle"
         self.hand = protocol.Hand(None)
         self.physics: dict[str, Any] = {}
+        self.terms: Mapping[str, Tensor] = {}  # of the reward, as they were last
         self.num_frames = self.num_steps = 0
         self._reset(seed)
         self._choose_policy(policy)
@@ -125,6 +133,7 @@ class Session:
             "reach": reach(spec.patch / NODES, self.env.action_resolution),
             "matter": {"mu": spec.mu, "yield_stress": spec.yield_stress, "gravity": -spec.gravity[1]},
             "draws": ["body", *(["target"] if "target" in known else [])],
+            "outline": outline(self.own_spec.robot),
             "policies": list(self.policies),
             "policy": self.policy_name,
             "flags": FLAGS,
@@ -155,6 +164,7 @@ class Session:
             case protocol.Hand():
                 self.grip = self.grip if message.tool == self.hand.tool else None
                 self.hand = message
+                self._take_hold()  # of what is under the pointer now, even if the next step comes later
             case protocol.Paint() | protocol.Clear():
                 self._paint(message)
             case protocol.Wave():
@@ -222,12 +232,12 @@ class Session:
 
     def _reset(self, seed: int) -> None:
         self.observation, self.seed = self.env.reset(seed=seed, options={"physics": self.physics})[0], seed
-        self.grip, self.terms = None, {}
+        self.grip = None
         self.rows: list[list[float]] = []
         self.painted = self.action = np.zeros(self.env.action_shape, np.float32)
         self.gate = np.zeros((2, 0, 0), np.float32)
         self.shot = self.env.shot()
-        drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
+        drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray | Figure)]
         touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
         self.history = History(seed, Recording(describe(self.env.model), [self.shot]), touched)
 
@@ -260,16 +270,24 @@ class Session:
         layout = trained_layout(self.policy) or "image"
         return from_grid_layout(to_grid_layout(torch.as_tensor(array), layout), "image").numpy()
 
+    def _take_hold(self) -> None:
+        """Let the hand take hold of matter that it is to pull at, unless it holds some."""
+        if self.hand.tool == "pull" and self.grip is None:
+            point, num_robot = self._point(), self.env.model.num_robot_particles
+            self.grip = Grip.take(self.env.env_state.particles, point, num_robot)
+
     def _pull(self) -> None:
-        """Let the hand pull at matter, which it takes hold of the first time."""
-        if self.hand.tool != "pull":
-            return
-        state = self.env.env_state
-        point = state.centre.new_tensor((self.hand.x, self.hand.y))
-        self.grip = self.grip or Grip.take(state.particles, point)
+        """Let the hand pull at what it holds, or at what has come to it."""
+        self._take_hold()
         if self.grip is not None:
-            self.env.env_state = replace(state, particles=self.grip.pull(state.particles, point))
+            state = self.env.env_state
+            pulled = self.grip.pull(state.particles, self._point(), self.control_step)
+            self.env.env_state = replace(state, particles=pulled)
             self.history.note("pulled by hand")
+
+    def _point(self) -> Tensor:
+        """Where the hand is, (2,), m."""
+        return self.env.env_state.centre.new_tensor((self.hand.x, self.hand.y))
 
     def _corner(self) -> np.ndarray:
         """Lower left corner (2,) of the action image in the world, m."""
@@ -358,10 +376,11 @@ class Session:
             raise ValueError(f"pixels must be those of a square, got {len(message.pixels)}")
         picture = np.frombuffer(message.pixels, np.uint8).reshape(size, size)
         old = vars(self).copy()
-        self.options = {**self.options, message.what: picture}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
+                drawing = picture if message.scale == 1 else self._scaled(picture, message.scale)
+                self.options = {**self.options, message.what: drawing}
                 self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
                 self._reset(self.seed)
                 self._choose_policy(self.policy_name)
@@ -371,3 +390,22 @@ class Session:
         self.saved = None
         notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)
         return [{"type": "hello", **self.describe()}, {"type": "reset"}, *notices]
+
+    def _scaled(self, picture: np.ndarray, scale: float) -> Figure:
+        """A drawn robot that is smaller than the task's own, in its place."""
+        whole = with_body(self.own_spec, picture).robot.shape
+        assert isinstance(whole, Figure)
+        left = whole.corner[0] + 0.5 * (1 - scale) * whole.size[0]
+        return replace(whole, pixel=scale * whole.pixel, corner=(left, whole.corner[1]))
+
+
+def outline(body: BodySpec) -> list[list[list[float]]]:
+    """Closed lines of points (x, y) around a body and its holes; its longer side has 100 units, its middle is at 0."""
+    points = probe(body)
+    size = np.ptp(points, axis=0)
+    columns, rows = (10 + (points - points.min(0)) * (100 / size.max())).astype(int).T
+    mask = np.zeros((121, 121), np.uint8)
+    mask[rows, columns] = 1
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))  # there are gaps between the points
+    lines, _ = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    return [(line[:, 0] - 10 - 50 * size / size.max()).round(1).tolist() for line in lines]

@@ -29,7 +29,8 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
     """The task with another robot.
 
     Pictures and outlines keep the area, particles and mass of the task's own robot, and stand where it stood: same
-    centre in x, same lowest point. A shape lies where it says, and is filled as densely. A body is taken as it is.
+    centre in x, same lowest point. With thicker lines they take less room. A shape lies where it says, and is filled as
+    densely: a picture of another size is a :class:`dittogym.bodies.shapes.Figure`. A body is taken as it is.
 
     Args:
         spec: The task.

@@ -11,8 +11,9 @@ from typing import Any
 from dittogym.bodies.drawings import BodyLike, with_body
 from dittogym.bodies.json_values import from_values
 from dittogym.bodies.positions import check_place
+from dittogym.bodies.shapes import Shape
 from dittogym.geometry import Obstacle
-from dittogym.spec import TaskSpec
+from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks.catch import catch
 from dittogym.tasks.dig import dig
 from dittogym.tasks.grow import grow
@@ -103,6 +104,12 @@ def make_spec(
         checks.instances("obstacles", obstacles, Obstacle)
         spec = replace(spec, obstacles=tuple(obstacles))
     if body is not None:
-        spec = with_body(spec, from_values(body) if isinstance(body, Mapping) else body)
-    check_place(spec)
+        body = from_values(body) if isinstance(body, Mapping) else body
+        spec = with_body(spec, body)
+    try:
+        check_place(spec)
+    except ValueError as error:
+        if body is None or isinstance(body, Shape | BodySpec):
+            raise
+        raise ValueError(f"{error}; thicken the drawing or scale it down") from error
     return spec

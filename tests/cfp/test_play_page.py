@@ -16,9 +16,9 @@ from cfp.play.session import Session
 class Played:
     """A page that is open, and the simulation behind it."""
 
-    def __init__(self, browser: Any, width: int = 1280, task: str = "run") -> None:
+    def __init__(self, browser: Any, width: int = 1280, task: str = "run", root_path: str = "") -> None:
         self.sessions: list[Session] = []
-        self.server = Server(lambda: self._session(task), "secret", port=0)
+        self.server = Server(lambda: self._session(task), "secret", port=0, root_path=root_path)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
         self.errors: list[str] = []
@@ -46,6 +46,23 @@ class Played:
     def place(self, x: float, y: float) -> tuple[float, float]:
         """Where in the window a point of the world is drawn, pixels."""
         return tuple(self.page.evaluate("([x, y]) => stats.place(x, y)", [x, y]))
+
+    def pixel(self, x: float, y: float) -> list[int]:
+        """Red, green and blue of the picture at a point of the world."""
+        code = """([x, y]) => { const canvas = document.getElementById("scene"), box = canvas.getBoundingClientRect();
+            const at = [(x - box.left) * canvas.width / box.width, (y - box.top) * canvas.height / box.height];
+            return [...canvas.getContext("2d").getImageData(...at, 1, 1).data].slice(0, 3); }"""
+        return self.page.evaluate(code, list(self.place(x, y)))  # type: ignore[no-any-return]
+
+    def draw(self, *points: tuple[float, float]) -> None:
+        """Draw a line on the pad."""
+        box = self.page.locator("#paper").bounding_box()
+        at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
+        self.page.mouse.move(*at[0])
+        self.page.mouse.down()
+        for point in at[1:]:
+            self.page.mouse.move(*point, steps=5)
+        self.page.mouse.up()
 
     def close(self) -> None:
         self.server.stop()
@@ -83,15 +100,8 @@ def test_the_robot_is_drawn_where_it_is(played: Played) -> None:
     played.until(lambda: not played.session.playing)
     page.wait_for_timeout(300)
     x, y = played.session.env.env_state.centre[0].tolist()
-
-    def pixel(x: float, y: float) -> list[int]:
-        code = """([x, y]) => { const canvas = document.getElementById("scene"), box = canvas.getBoundingClientRect();
-            const at = [(x - box.left) * canvas.width / box.width, (y - box.top) * canvas.height / box.height];
-            return [...canvas.getContext("2d").getImageData(...at, 1, 1).data]; }"""
-        return page.evaluate(code, list(played.place(x, y)))  # type: ignore[no-any-return]
-
-    robot, air, floor = pixel(x, y), pixel(x + 0.137, y + 0.1), pixel(x + 0.137, 0.1)
-    assert max(robot[:3]) < 150 and min(air[:3]) > 240 and floor[:3] == [112, 119, 130]
+    robot, air, floor = (played.pixel(x + dx, y + dy) for dx, dy in ((0, 0), (0.137, 0.1), (0.137, 0.1 - y)))
+    assert max(robot) < 150 and min(air) > 240 and floor == [112, 119, 130]
 
 
 def test_keys_and_brush(played: Played) -> None:
@@ -149,12 +159,17 @@ def test_a_film_of_what_is_shown(played: Played) -> None:
 
 def test_a_drawn_robot(played: Played) -> None:
     page, session = played.page, played.session
+    played.until(lambda: page.locator("#terms li").count() > 3)
+    terms = page.inner_text("#terms").split("\n")[0]
     page.click("#draw")
-    box = page.locator("#paper").bounding_box()
-    page.mouse.move(box["x"] + 130, box["y"] + 160)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 190, box["y"] + 160, steps=5)
-    page.mouse.up()
+    played.until(lambda: page.inner_text("#play") == "Play")
+    paper = """() => { const { data } = document.getElementById("paper").getContext("2d").getImageData(0, 0, 256, 256);
+        return data.filter((value, k) => k % 4 === 0 && value > 60).length; }"""
+    outline = page.evaluate(paper)
+    page.hover("#paper")
+    brush = page.evaluate(paper)
+    assert 100 < outline < 2000 and 20 < brush - outline < 400
+    played.draw((0.5, 0.6), (0.75, 0.6))
     page.click("#use")
 
     def is_wide() -> bool:
@@ -162,9 +177,71 @@ def test_a_drawn_robot(played: Played) -> None:
         return bool(width > 1.8 * height)
 
     played.until(is_wide)
+    played.until(lambda: not page.is_visible("#pad") and page.inner_text("#play") == "Pause")
+    played.until(lambda: page.inner_text("#step") != "0")
+    assert page.inner_text("#terms").startswith(terms)
+
+
+def test_a_drawing_that_is_refused_stays_until_it_fits(played: Played) -> None:
+    page, session = played.page, played.session
     page.click("#draw")
     page.click("#use")  # nothing was drawn
-    played.until(lambda: "body must be a picture" in page.inner_text("#toasts"))
+    played.until(lambda: "body must be a picture" in page.inner_text("#hint"))
+    for remedy in ("#thicken", "#shrink"):
+        played.until(lambda: page.inner_text("#play") == "Play")
+        before = session.env
+        page.click("#wipe")
+        assert not page.is_visible(remedy)
+        played.draw((0.1, 0.5), (0.9, 0.5))
+        page.click("#use")
+        played.until(lambda: "thicken the drawing or scale it down" in page.inner_text("#hint"))
+        assert session.env is before
+        page.click(remedy)
+        played.until(lambda: not page.is_visible("#pad"))
+        shape, own = session.env.spec.robot.shape, session.own_spec.robot.shape
+        assert shape.size[0] > (1.5 if remedy == "#thicken" else 3) * shape.size[1]
+        assert (shape.area < 0.9 * own.area) == (remedy == "#shrink")
+        page.click("#draw")
+
+
+def test_a_dialog_stops_time(played: Played) -> None:
+    page, session = played.page, played.session
+    for before, button in (("Pause", "#help"), ("Play", "#draw")):
+        played.until(lambda before=before: page.inner_text("#play") == before)
+        page.click(button)
+        played.until(lambda: page.inner_text("#play") == "Play")
+        step = session.num_steps
+        page.wait_for_timeout(200)
+        assert session.num_steps == step
+        page.keyboard.press("Escape")
+        played.until(lambda before=before: page.inner_text("#play") == before)
+        page.click("#play")
+
+
+def test_a_simulation_that_has_failed_is_shown_as_it_was(played: Played) -> None:
+    page, session = played.page, played.session
+    page.click("#play")
+    played.until(lambda: page.inner_text("#play") == "Play")
+    page.wait_for_timeout(300)
+    at = session.env.env_state.centre[0].tolist()
+    place, colour = played.place(*at), played.pixel(*at)
+    session.env.state.v.fill_(np.nan)
+    page.click("#once")
+    played.until(lambda: page.is_visible("#verdict"))
+    page.wait_for_timeout(300)
+    assert not np.isfinite(session.shot.x).any()
+    assert played.pixel(*at) == colour and np.allclose(played.place(*at), place, atol=2)
+    page.click("#reset")
+    played.until(lambda: not page.is_visible("#verdict"))
+    assert np.allclose(played.place(*at), place, atol=2)
+
+
+def test_behind_a_proxy(browser: Any) -> None:
+    """What the page loads, and the connection, are below its own path."""
+    played = Played(browser, root_path="/user/me")
+    assert "/user/me/?token=" in played.page.url and played.page.inner_text("#task") == "RUN"
+    played.close()
+    assert played.errors == []
 
 
 def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
@@ -174,8 +251,9 @@ def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
     assert played.page.locator("#what option").count() == 2 and played.page.input_value("#speed") == "0.1"
     played.page.click("#draw")
     assert played.page.evaluate("scrollY") > 0
+    played.draw((0.5, 0.5), (0.5, 0.5))
     played.page.click("#use")
-    assert played.page.evaluate("scrollY") == 0  # the robot is in sight again
+    played.until(lambda: played.page.evaluate("scrollY") == 0)  # the robot is in sight again
     played.server.stop()
     played.until(lambda: played.page.is_visible("#lost"))
     played.close()

@@ -33,17 +33,26 @@ SMALL: dict[str, Any] = {"particles": 200, "substeps": 10}
 MALFORMED = ["", "null", '{"type": "play"}', '{"type": "policy", "name": "../../etc/passwd"}']
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    """A server on a free port, in a thread; the kernels are compiled before pages wait for pictures."""
-    Session("run", **SMALL).advance()
-    server = Server(partial(Session, "run", **SMALL), "secret", port=0)
+@contextlib.contextmanager
+def serve(root_path: str = "") -> Iterator[Server]:
+    """A server on a free port, in a thread."""
+    server = Server(partial(Session, "run", **SMALL), "secret", port=0, root_path=root_path)
     thread = threading.Thread(target=server.run)
     thread.start()
-    yield server
-    server.stop()
-    thread.join(10)
+    try:
+        yield server
+    finally:
+        server.stop()
+        thread.join(10)
     assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """A server; the kernels are compiled before pages wait for pictures."""
+    Session("run", **SMALL).advance()
+    with serve() as server:
+        yield server
 
 
 def open_page(server: Server, token: str = "secret", origin: str | None = "own") -> ClientConnection:
@@ -97,6 +106,37 @@ def test_page_and_token(server: Server) -> None:
 def test_strangers_are_refused(server: Server, token: str, origin: str | None) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         open_page(server, token, origin)
+
+
+@pytest.mark.parametrize(
+    ("root_path", "host", "origin", "stranger"),
+    [
+        ("https://Hub.example.org/user/me", "hub.example.org", "https://hub.example.org", "http://hub.example.org"),
+        ("https://hub.example.org/user/me/", "127.0.0.1:8000", "https://hub.example.org", "http://127.0.0.1:8000"),
+        ("/user/me", "127.0.0.1:9000", "http://127.0.0.1:9000", "https://hub.example.org"),
+    ],
+    ids=["whole address", "host not passed on", "path alone"],
+)
+@pytest.mark.parametrize("prefix", ["", "/user/me"])
+def test_behind_a_proxy(prefix: str, root_path: str, host: str, origin: str, stranger: str) -> None:
+    """With the path that the proxy may take away, for its page and no other."""
+    with serve(root_path) as server:
+
+        def open_page(token: str, origin: str | None) -> ClientConnection:
+            stream = stack.enter_context(socket.create_connection(("127.0.0.1", server.port)))
+            return connect(f"ws://{host}{prefix}/ws?token={token}", sock=stream, origin=origin, proxy=None)  # type: ignore[arg-type]
+
+        for path, code in (("/?token=secret", 200), ("/page/main.js", 200), ("/?token=guess", 403)):
+            assert status(server, prefix + path, host)[0] == code
+        assert status(server, f"{prefix}/?token=secret", "example.com")[0] == 400
+        with contextlib.ExitStack() as stack:
+            for token, source in (("guess", origin), ("secret", stranger), ("secret", None)):
+                with pytest.raises(InvalidStatus, match="403"):
+                    open_page(token, source)
+            with open_page("secret", origin) as page:
+                assert receive(page, "hello")["task"] == "run"
+        start = "https://hub.example.org" if server.proxy else f"http://127.0.0.1:{server.port}"
+        assert server.address == f"{start}/user/me/?token=secret"
 
 
 def test_malformed_messages_are_answered_and_survived(server: Server) -> None:
@@ -228,6 +268,7 @@ def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
             ("run --particles 0", "particles must"),
             ("run --body nowhere.png", "no such file"),
             ("run --particles 200 --port 99999", "port must"),
+            ("run --particles 200 --root-path example.org/user", "root_path must"),
             (f"run --particles 200 --port {other.getsockname()[1]}", "in use"),
         ):
             assert program.main(text.split()) > 0

@@ -104,6 +104,22 @@ def test_pulling_moves_matter_towards_the_pointer() -> None:
         assert played.grip is None
 
 
+def test_a_pull_takes_hold_at_the_press_and_keeps_it() -> None:
+    """Although the pointer is far away before time goes on, and the robot hangs on its uppermost matter."""
+    played = session(particles="lite", substeps=100)
+    num_robot = played.env.model.num_robot_particles
+    start = played.env.state.x[0, :num_robot]
+    top = start[start[:, 1].argmax()]
+    played.apply(Hand("pull", float(top[0]), float(top[1]) + 0.03))
+    for _ in range(100):
+        played.apply(Hand("pull", float(top[0]), float(top[1]) + 0.23))
+        played.advance()
+    x = played.env.state.x[0, :num_robot]
+    uppermost = x[(start - top).norm(dim=1) < 0.03].mean(0)
+    assert abs(float(uppermost[1] - top[1]) - 0.2) < 0.05 and abs(float(uppermost[0] - top[0])) < 0.03
+    assert float((x - start).mean(0)[1]) > 0.15 and np.ptp(x.numpy(), axis=0).max() < 0.22  # all of it, in one piece
+
+
 def test_muscles_under_the_pointer() -> None:
     """The action has its largest value in the cell that holds the pointer, and acts there."""
     played = session(resolution=16)
@@ -291,8 +307,8 @@ def test_files_after_going_back_are_of_what_led_there() -> None:
     assert torch.equal(env.state.x, played.env.state.x)
 
 
-def drawing(mask: np.ndarray, what: str) -> Draw:
-    return Draw(what, (mask.astype(np.uint8) * 255).tobytes())
+def drawing(mask: np.ndarray, what: str, scale: float = 1.0) -> Draw:
+    return Draw(what, (mask.astype(np.uint8) * 255).tobytes(), scale)
 
 
 def test_drawings() -> None:
@@ -313,6 +329,40 @@ def test_drawings() -> None:
     assert played.env is before
     answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
     assert answers[-1]["type"] == "notice" and "no robot can be expected" in answers[-1]["message"]
+
+
+def test_a_robot_that_does_not_fit_its_place_can_be_scaled_down() -> None:
+    y, x = np.mgrid[:128, :128] - 63.5
+    bar = (abs(x) < 60) & (abs(y) < 8)
+    for task in ("run", "obstacle"):
+        played = session(task)
+        with pytest.raises(ValueError, match="thicken the drawing or scale it down"):
+            played.apply(drawing(bar, "body"))
+        played.apply(drawing(bar, "body", scale=0.5))
+        own, drawn = played.own_spec.robot, played.env.spec.robot
+        assert drawn.shape.area == pytest.approx(own.shape.area / 4)
+        assert drawn.shape.corner[1] == own.shape.corner[1]
+        middles = [body.shape.corner[0] + body.shape.size[0] / 2 for body in (own, drawn)]
+        assert middles[0] == pytest.approx(middles[1])
+        assert played.history.touched == ["a drawn body"]
+        played.advance()
+
+
+def test_the_terms_of_the_reward_outlast_resets_and_drawings() -> None:
+    played = session()
+    played.advance()
+    names = list(played.terms)
+    played.apply(Reset())
+    assert list(played.terms) == names and shown(played).rows.shape == (0, 1 + len(names))
+    hello, *_ = played.apply(drawing(np.ones((64, 64)), "body"))
+    assert hello["terms"] == names
+
+
+def test_the_outline_is_that_of_the_tasks_own_robot() -> None:
+    disc = session("run", body=np.ones((8, 8), bool)).describe()["outline"]
+    assert len(disc) == 1 and np.allclose(np.linalg.norm(disc[0], axis=1), 50, atol=3)
+    (square,) = session("obstacle").describe()["outline"]
+    assert np.allclose(np.abs(square).max(axis=1), 50, atol=3)
 
 
 def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
@@ -366,8 +416,9 @@ def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
         ('{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}', "stiffness"),
         ('{"type": "save", "what": "../../x"}', "what"),
         ('{"type": "draw", "what": "body", "pixels": "AAAA"}', "pixels"),
+        (json.dumps({"type": "draw", "what": "body", "pixels": "A" * 88, "scale": 1.5}), "scale"),
     ],
-    ids=range(11),
+    ids=range(12),
 )
 def test_malformed_messages(text: str, field: str) -> None:
     with pytest.raises(ValueError, match=field) as caught:

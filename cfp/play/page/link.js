@@ -4,7 +4,9 @@ export class Link {
   constructor(handlers) {
     this.handlers = handlers;
     this.flags = [];
-    this.socket = new WebSocket(`ws://${location.host}/ws${location.search}`);
+    const address = new URL(`ws${location.search}`, location.href);  // below the page's own, whatever is before it
+    address.protocol = address.protocol.replace("http", "ws");
+    this.socket = new WebSocket(address);
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = (event) => this.receive(event.data);
     this.socket.onclose = (event) => handlers.closed(event);

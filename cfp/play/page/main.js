@@ -30,6 +30,7 @@ const link = new Link({
     options($("policy"), [["", "off"], ...task.policies.map((name) => [name, name])], task.policy ?? "");
     options($("colour"), Object.keys(task.scales).map((name) => [name, name]), ui.colour);
     policy = task.policy ?? policy;
+    if (pad.waiting) pad.accept();
     pad.setTask(task);
     $("back").disabled = !task.saved;
     showScale();
@@ -39,17 +40,20 @@ const link = new Link({
   policy(message) { $("policy").value = message.name ?? ""; policy = message.name ?? policy; task.reach = message.reach; },
   reset() { plot.reset(); },
   notice(message) { toast(message.message); },
-  error(message) { toast(message.message, "error"); },
+  error({ message }) { pad.waiting ? pad.refuse(message) : toast(message, "error"); },
   file({ name, content }) {
     download(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))]));
     if (name.endsWith(".pt")) $("back").disabled = false;
   },
   frame(next) {
     plot.add(next.rewards);
+    // There is nothing to see of a failed simulation: the picture stays that of the last frame before.
+    if (next.invalid && frame) for (const name of ["centre", "corner", "positions", "codes"]) next[name] = frame[name];
     frame = next;
     fresh = true;
   },
   closed({ code }) {
+    for (const dialog of document.querySelectorAll("dialog")) dialog.close();
     $("lost").hidden = false;
     $("lost").textContent = code === 1013 ? "Too many pages play at once. Close another one, then load this page again."
       : "The program has stopped, or this page is no longer known to it. Start it again and open the new address.";
@@ -224,9 +228,21 @@ $("moment").onclick = () => link.send("save", { what: "moment" });
 $("actions").onclick = () => link.send("save", { what: "actions" });
 $("replay").onclick = () => link.send("save", { what: "replay" });
 $("back").onclick = () => link.send("back");
-$("draw").onclick = () => pad.open();
-$("help").onclick = () => $("about").showModal();
+$("draw").onclick = () => {
+  if (!task) return;
+  pad.wipe();
+  showDialog($("pad"));
+};
+$("help").onclick = () => showDialog($("about"));
 $("close").onclick = () => $("about").close();
+
+// Time stops while a dialog is open.
+function showDialog(dialog) {
+  const playing = frame?.playing ?? true;
+  link.send("play", { playing: false });
+  dialog.addEventListener("close", () => link.send("play", { playing }), { once: true });
+  dialog.showModal();
+}
 
 const ARROWS = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down" };
 const KEYS = {
