@@ -34,6 +34,8 @@ from dittogym.render.recording import seed_noise
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
+#: How tables name a policy that was made for one start: on that start, and on those of the other policies.
+PLAN, REPLAYED = "plan", "plan, replayed from another start"
 
 
 def evaluation_seed(config: RunConfig) -> int:
@@ -44,6 +46,16 @@ def evaluation_seed(config: RunConfig) -> int:
 def without_noise(policy: Policy, noise: Noise) -> bool:
     """Whether a policy acts without noise."""
     return policy.deterministic_by_default if noise == "default" else noise == "without"
+
+
+def is_plan(policy: Policy) -> bool:
+    """Whether a policy is a plan: actions made for one start, whose seed its description names."""
+    return "layout" in policy.description
+
+
+def name_in_table(name: str, policy: Policy) -> str:
+    """How a table of results names a policy, on starts that are the same for all policies."""
+    return REPLAYED if is_plan(policy) else name
 
 
 def decision_grid(policy: Policy) -> int:
@@ -340,20 +352,20 @@ def evaluate(
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
+    """Evaluate policies beside zero and random action on the same layouts; a plan also on the one it was made for."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
     trials = [
         make_trial(config, f"{kind} action", UntrainedPolicy(kind, coarsest), episodes, deterministic=True, seed=seed)
         for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
-        default = without_noise(trained, noise)
-        for deterministic in (False, True) if noise == "both" else (default,):
-            label = f"{name}, {'mean' if deterministic else 'noisy'}" if noise == "both" else name
-            trials.append(make_trial(config, label, trained, episodes, deterministic=deterministic, seed=seed))
-        if "layout" in trained.description:
+        default, shown = without_noise(trained, noise), name_in_table(name, trained)
+        if is_plan(trained):
             own = trained.description["layout"]
-            trials.append(make_trial(config, "  own layout", trained, 1, deterministic=default, seed=own))
+            trials.append(make_trial(config, PLAN, trained, 1, deterministic=default, seed=own))
+        for deterministic in (False, True) if noise == "both" else (default,):
+            label = f"{shown}, {'mean' if deterministic else 'noisy'}" if noise == "both" else shown
+            trials.append(make_trial(config, label, trained, episodes, deterministic=deterministic, seed=seed))
     return evaluate(trials, config.make_spec().horizon)
 
 
@@ -385,12 +397,38 @@ def format_table(config: RunConfig, results: Sequence[Result]) -> str:
     """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
     counts = {len(result.returns) for result in results}
     title = f"{config.task}, return over {' or '.join(map(str, sorted(counts)))} episodes"
-    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
+    width = max(16, *(len(result.name) + 2 for result in results))
+    titles = f"{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"
+    lines = [title, f"{'policy':<{width}}{titles}"]
     for result in results:
         grid = f"{result.resolution}x{result.resolution}"
         interval = "–" if result.interval is None else f"{result.interval:.1f}"
         spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
         spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
         success = "" if result.success is None else f"   success {result.success:.0%}"
-        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}   in one piece {result.piece:.0%}")
+        lines.append(f"{result.name:<{width}}{grid:>8}{spread}{success}   in one piece {result.piece:.0%}")
     return "\n".join(lines)
+
+
+def explain(config: RunConfig, results: Sequence[Result], chosen: bool) -> str:
+    """Why the final table of a run and the evaluations during its training have different numbers.
+
+    Args:
+        config: Options of the run.
+        results: The table.
+        chosen: Whether the evaluations chose the policy.
+    """
+    sentences = []
+    if chosen and config.eval_every:
+        varied = any(config.conditions(stage) for stage in range(1, len(config.ends()) + 1))
+        conditions = " The conditions of those episodes varied, of these they do not." if varied else ""
+        sentences.append(
+            "Evaluations during training give other numbers: they chose the policy, so the best of them is partly "
+            f"luck. This table is of other episodes, from starts that neither trained nor chose the policy.{conditions}"
+        )
+    if any(result.name == PLAN for result in results):
+        sentences.append(
+            "A plan is made for one start, and its own episode was the evaluation during training; the row below it "
+            "shows what the same actions do from other starts."
+        )
+    return " ".join(sentences)

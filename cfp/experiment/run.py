@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from stable_baselines3.common.logger import Logger
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.page import plot_curve, write_page
-from cfp.evaluation.returns import compare, format_table, to_rows
+from cfp.evaluation.page import draw_curve, write_figure, write_page
+from cfp.evaluation.returns import compare, explain, format_table, name_in_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
     CheckpointCallback,
@@ -185,12 +186,16 @@ class TrainingRun:
         results = compare(self.config, policies, self.config.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
         print(format_table(self.config, results))
-        best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
-        if best != list(files)[-1]:
-            print(f"{best} has the highest mean return; its policy is {files[best]}")
+        note = explain(self.config, results, self.learner.keeps_best)
+        print("\n".join(textwrap.wrap(note, 100)))
+        shown = {name_in_table(name, policies[name]): path for name, path in files.items()}
+        best = max((result for result in results if result.name in shown), key=lambda result: result.mean).name
+        if best != list(shown)[-1]:
+            print(f"{best} has the highest mean return; its policy is {shown[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
-        print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
+        write_figure(self.folder / "curve.png", draw_curve(self.folder, self.config, untrained))
+        print(f"learning curve: {self.folder / 'curve.png'}")
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
+        print(f"all of it on one page: {write_page(self.folder, self.config, results, note)}")

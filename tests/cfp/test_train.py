@@ -258,9 +258,10 @@ def test_page_shows_the_run_and_opens_from_disk(finished):
     page = (finished / "index.html").read_text()
     assert 'src="curve.png"' in page and "http" not in page and "<video" not in page  # filmed nothing
     for row in json.loads((finished / "results.json").read_text()):
-        means = {f"<td>{row['mean'] + rounding:.1f}</td>" for rounding in (-5e-4, 5e-4)}  # the file has three digits
-        assert f'<td class="text">{row["policy"]}</td>' in page and any(mean in page for mean in means)
+        means = {f"{row['mean'] + rounding:.1f}</td>" for rounding in (-5e-4, 5e-4)}  # the file has three digits
+        assert f">{row['policy']}</td>" in page and any(mean in page for mean in means)
     assert html.escape((finished / "config.json").read_text().strip()) in page
+    assert "chose the policy" in page  # why the table and the curve differ
 
 
 def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
