@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from scipy.special import stdtrit  # scipy.stats takes a second to import
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from tqdm import tqdm
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import DIVERGED
 from cfp.errors import NonFiniteError
+from cfp.messages import progress_bar
 from cfp.policy import Memory, Observation, Policy, Start, StatePolicy
 from dittogym import Conditions, TorchEnv
 from dittogym.copies import to_device, to_host
@@ -228,14 +228,15 @@ def play(
 
     Args:
         trials: What to play.
-        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
     """
     spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
     workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
     total = (steps or 0) * sum(trial.episodes for trial in trials)
-    bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
+    # Beside the bar of a training (leave=None) it vanishes at the end.
+    bar = progress_bar(total=total, desc="evaluation", leave=None, **({} if total else {"disable": True}))
 
     def play_span(trial: Trial, first: int, count: int) -> list[Played]:
         taken = 0
@@ -344,7 +345,7 @@ def evaluate(
 
     Args:
         trials: Episodes, all played side by side.
-        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
     """
     played = zip(trials, play(trials, steps, should_stop), strict=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from short_episodes import HORIZON
-from tiny_runs import TINY, at_step
+from tiny_runs import TINY, assert_same_run, at_step
 
 import cfp
 from cfp import train
@@ -32,6 +32,29 @@ def test_fit_is_the_command_line_and_resumes_after_ctrl_c(tmp_path):
     run = cfp.fit("shapematch", steps=30, out=str(folder), resume=True, **OPTIONS | short)
     assert [row["step"] for row in read_table(folder / "progress.csv")] == ["10", "20", "30"]
     assert run.folder == folder and run.policy.description["steps"] == 30
+
+
+class Pruned(Exception):
+    """As a library that searches for options raises it to end a training that does not look promising."""
+
+
+def test_a_training_is_quiet_if_asked_to_and_can_be_ended_by_its_evaluations(finished, tmp_path, capfd):
+    rows = []
+
+    def prune(row):
+        rows.append(row)
+        if row["step"] == 120:
+            raise Pruned
+
+    folder = tmp_path / "run"
+    with pytest.raises(Pruned):
+        cfp.fit("shapematch", steps=150, out=folder, quiet=True, on_evaluation=prune, **OPTIONS)
+    assert [(row["step"], row["stage"]) for row in rows] == [(60, 1), (70, 1), (70, 2), (120, 2)]
+    assert not (folder / "results.json").exists()
+    run = cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=rows.append, **OPTIONS)
+    assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
+    assert_same_run(folder, finished)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
