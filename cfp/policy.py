@@ -117,6 +117,7 @@ class ActorPolicy(nn.Module, Shareable):
     """
 
     uses_image = True
+    __repr__ = Shareable.__repr__  # that of a module lists every layer
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False, actor: Actor | None = None) -> None:
         super().__init__()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,6 +14,8 @@ from cfp import messages, registry
 from cfp.config import Particles, Preset, RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
+from cfp.evaluation.page import draw_curve
+from cfp.evaluation.returns import REPLAYED
 from cfp.evaluation.video import record_policy
 from cfp.experiment.callbacks import OnEvaluation
 from cfp.experiment.cli import Stopped, keep_memory
@@ -90,7 +94,23 @@ class Run:
         return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.folder)!r})"
+        """Folder, task, action grid of the last stage, and the mean return of its policy, once the run is finished."""
+        config, returned = self.config, ""
+        with suppress(CheckpointError):
+            last = [row for row in self.results if row["policy"] != REPLAYED][-1]
+            returned = f", mean_return={last['mean']:.1f}"
+        resolution = config.resolution(len(config.ends()))
+        about = f"{str(self.folder)!r}, task={config.task!r}, resolution={resolution}{returned}"
+        return f"{type(self).__name__}({about})"
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: the learning curve, also of a run in training."""
+        baselines: dict[str, float] = {}
+        with suppress(CheckpointError):
+            baselines = {row["policy"]: row["mean"] for row in self.results[:2]}
+        picture = BytesIO()
+        draw_curve(self.folder, self.config, baselines).savefig(picture, format="png", dpi=100)
+        return picture.getvalue()
 
 
 def _folder(name: str, given: Any) -> Path:

@@ -148,6 +148,13 @@ def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
     assert actions.sum(dtype=np.float64) == pytest.approx(total, abs=1e-3, rel=1e-6)
 
 
+def test_representation_says_what_a_policy_is_for():
+    policy = cfp.load("run")
+    steps, seed = policy.description["steps"], policy.description["seed"]
+    assert repr(policy) == f"ActorPolicy(task='run', resolution={policy.resolution}, steps={steps}, seed={seed})"
+    assert repr(cfp.ActorPolicy(policy.spec)) == f"ActorPolicy(resolution={policy.resolution})"
+
+
 def test_a_folder_without_a_policy_hides_no_shipped_one(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     monkeypatch.chdir(tmp_path)

@@ -64,6 +64,9 @@ def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
     best = max((row for row in run.evaluations if row["stage"] == 2), key=lambda row: row["mean"])
     assert run.policy.description["steps"] == best["step"]
     assert [row["policy"] for row in run.results] == ["zero action", "random action", "stage 1", "stage 2"]
+    returned = f"{run.results[-1]['mean']:.1f}"
+    assert repr(run) == f"Run({str(finished)!r}, task='shapematch', resolution=8, mean_return={returned})"
+    assert run._repr_png_().startswith(b"\x89PNG")
     recording = run.film(tmp_path / "film.html", speed=0.5)
     assert len(recording.rewards) == HORIZON and (tmp_path / "film.html").stat().st_size > 10_000
     with pytest.raises(ValueError, match="path must end in"):
@@ -77,6 +80,8 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
     run = cfp.Run(tmp_path)
     assert run.policy.resolution == 64 and run.evaluations == []
+    assert repr(run) == f"Run({str(tmp_path)!r}, task='shapematch', resolution=8)"
+    assert run._repr_png_().startswith(b"\x89PNG")  # no evaluation yet
     with pytest.raises(cfp.CheckpointError, match="not finished"):
         _ = run.results
     (tmp_path / "results.json").write_text('[{"policy": ')

@@ -1,6 +1,7 @@
 """Films, filmstrips and replays of an episode."""
 
 import base64
+import io
 import json
 import re
 import zlib
@@ -142,6 +143,17 @@ def test_environments_of_gymnasium_film_too(tmp_path) -> None:
     recorded = env.film(wave, tmp_path / "film.html", seed=1)
     assert (tmp_path / "film.html").stat().st_size > 1000 and len(recorded.rewards) == 30
     assert "<iframe" in recorded._repr_html_() and env._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_notebook_shows_all_robots_of_a_batch() -> None:
+    batch = gymnasium.make_vec("dittogym/run-coarse-v0", num_envs=3, **SMALL)
+    assert batch._repr_png_() is None
+    batch.reset(seed=0)
+    sheet = np.asarray(Image.open(io.BytesIO(batch._repr_png_())))
+    assert sheet.shape == (1028, 1028, 3)  # two rows of two, with a line of two pixels after each
+    for index, (row, column) in enumerate(((0, 0), (0, 514), (514, 0))):
+        assert np.array_equal(sheet[row : row + 512, column : column + 512], batch.torch_env.render(index))
+    assert (sheet[514:, 514:] == 255).all()
 
 
 def test_a_film_is_repeatable_and_leaves_torch_s_generator_alone() -> None:
