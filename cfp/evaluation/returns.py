@@ -139,6 +139,7 @@ class Played(NamedTuple):
     torn: bool  # ended by the limit on the robot's spread
     piece: float  # share of the robot in its largest piece after the last step, see `dittogym.pieces`
     mean_piece: float  # over the steps
+    terms: Mapping[str, float] = {}  # the sum of each term of the reward, with its weight; they add up to the total
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +170,7 @@ class Trial:
         memory, starts = None, np.ones(count, bool)
         totals = np.zeros(count, np.float32)  # added up as stable-baselines3 does
         pieces: list[np.ndarray] = []
+        terms: dict[str, np.ndarray] = {}
         played: dict[int, Played] = {}
         while len(played) < count:
             action, memory = acting.predict(as_numpy(observation), memory, starts, deterministic=self.deterministic)
@@ -177,8 +179,11 @@ class Trial:
             with torch.no_grad():
                 observation, *own, info = env.step(to_device(np.array(action, np.float32), env.device))
             found = dict(zip(("reward", "terminated", "truncated"), own, strict=True))
-            step = to_host(found | {name: info[name] for name in info.keys() & {"split", "is_success"}})
+            own_info = {name: info[name] for name in info.keys() & {"split", "is_success"}}
+            step = to_host(found | own_info | {f"term {name}": value for name, value in info["reward_terms"].items()})
             totals += step["reward"].astype(np.float32)
+            for name in info["reward_terms"]:
+                terms[name] = terms.get(name, 0.0) + step[f"term {name}"]
             pieces.append(largest_piece(env.state.x[:, : env.model.num_robot_particles], env.env_state.origin))
             starts = step["terminated"] | step["truncated"]
             for i in np.flatnonzero(starts).tolist():
@@ -187,7 +192,8 @@ class Trial:
                     torn = limit is not None and bool(step["split"][i] > limit)
                     success = bool(step["is_success"][i]) if "is_success" in step else None
                     share = [piece[i] for piece in pieces]
-                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)))
+                    sums = {name: float(values[i]) for name, values in terms.items()}
+                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)), sums)
             if starts.any() and len(played) < count:
                 with torch.no_grad():  # so that what has ended stays a robot, and not what is left of one
                     observation, _ = env.reset(options={"reset_mask": torch.from_numpy(starts)})
@@ -304,6 +310,11 @@ class Result:
     def interval(self) -> float | None:
         """Half the width of the 95 % confidence interval of the mean; None for one episode."""
         return t_interval(self.returns)
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """What each term of the reward, with its weight, contributes to the mean return."""
+        return {name: _mean(each.terms[name] for each in self.episodes) for name in self.episodes[0].terms}
 
     @property
     def success(self) -> float | None:

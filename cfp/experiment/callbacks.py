@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoardOutputFormat, filter_excluded_keys
+from stable_baselines3.common.logger import (
+    HParam,
+    Image,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+    filter_excluded_keys,
+)
 from torch.utils.tensorboard import SummaryWriter
 
 from cfp.config import RunConfig, to_json
@@ -51,6 +58,7 @@ EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",
     "eval/std": "standard deviation of these returns",
     "eval/success": "share of successes among them, where the task defines success",
+    "reward/TERM": "what each term of the task's reward, with its weight, contributes to eval/return",
 }
 
 
@@ -75,6 +83,12 @@ class EventFile(TensorBoardOutputFormat):
     def __init__(self, folder: Path, step: int) -> None:
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=step + 1 if step else None)
         self._is_closed = False
+
+    def write_options(self, config: RunConfig) -> None:
+        """Show the options of the run under HParams, beside its evaluations."""
+        plain = {name: v if isinstance(v, bool | int | float) else str(v) for name, v in to_json(config).items()}
+        shown = HParam(plain, dict.fromkeys(("eval/return", "eval/success"), 0.0))  # the last values count, not these
+        self.write({"options": shown}, {"options": ()})
 
 
 def check_wandb(config: RunConfig) -> None:
@@ -123,6 +137,7 @@ class WandbWriter(KVWriter):
 def make_trackers(config: RunConfig, folder: Path, step: int) -> list[KVWriter]:
     """The places to which a run's rows go besides its tables."""
     events = EventFile(folder / "tensorboard", step)
+    events.write_options(config)
     return [events, WandbWriter(config, folder)] if config.wandb != "off" else [events]
 
 
@@ -297,6 +312,7 @@ class EvaluationCallback(StageCallback):
         row = dict(zip(EVALUATION_COLUMNS, values, strict=True))
         self.table.add(row)
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
+        scalars |= {f"reward/{name}": value for name, value in result.terms.items()}
         for name, value in scalars.items():
             self.trackers.record(name, value)
         for name, picture in stage.learner.images().items():
