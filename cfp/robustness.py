@@ -155,7 +155,8 @@ class Evaluation:
             seed=SEED,
             conditions=conditions,
         )
-        result = evaluate([trial], self.config.make_spec().horizon)[0]
+        name = f"{self.name}, {self.case}, {self.particles}"
+        result = evaluate([trial], self.config.make_spec().horizon, name=name)[0]
         return self.head | _numbers(result)
 
 

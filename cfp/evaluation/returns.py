@@ -228,7 +228,10 @@ class EpisodesStopped(Exception):
 
 
 def play(
-    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+    trials: Sequence[Trial],
+    steps: int | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    name: str = "evaluation",
 ) -> list[list[Played]]:
     """Play the episodes of all trials, those of each in the order of their layouts.
 
@@ -236,13 +239,14 @@ def play(
         trials: What to play.
         steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
+        name: What the progress bar is called.
     """
     spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
     workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
     total = (steps or 0) * sum(trial.episodes for trial in trials)
     # Beside the bar of a training (leave=None) it vanishes at the end.
-    bar = progress_bar(total=total, desc="evaluation", leave=None, **({} if total else {"disable": True}))
+    bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))
 
     def play_span(trial: Trial, first: int, count: int) -> list[Played]:
         taken = 0
@@ -348,7 +352,10 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def evaluate(
-    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+    trials: Sequence[Trial],
+    steps: int | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    name: str = "evaluation",
 ) -> list[Result]:
     """Evaluate policies without learning; torch's generator is left as it was.
 
@@ -358,8 +365,9 @@ def evaluate(
         trials: Episodes, all played side by side.
         steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
+        name: What the progress bar is called.
     """
-    played = zip(trials, play(trials, steps, should_stop), strict=True)
+    played = zip(trials, play(trials, steps, should_stop, name), strict=True)
     return [Result(trial.name, trial.resolution, tuple(episodes)) for trial, episodes in played]
 
 
