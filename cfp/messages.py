@@ -33,6 +33,7 @@ def say(text: str, output: TextIO | None = None) -> None:
 
 def progress_bar(**options: Any) -> tqdm:
     """A progress bar with ``options`` of tqdm; one that is not on a terminal appears only if the work takes a while."""
-    is_terminal = getattr(sys.stderr, "isatty", bool)()
-    often = {} if is_terminal else {"mininterval": SELDOM, "delay": SELDOM}
-    return tqdm(**{**often, "unit": "step", "disable": _is_quiet.get() or sys.stderr is None} | options)
+    usual = {"unit": "step", "disable": _is_quiet.get() or sys.stderr is None}
+    if not (hasattr(sys.stderr, "isatty") and sys.stderr.isatty()):
+        usual |= {"mininterval": SELDOM, "delay": SELDOM, "position": 0}  # no cursor could move to another line
+    return tqdm(**usual | options)

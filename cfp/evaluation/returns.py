@@ -441,7 +441,7 @@ def explain(config: RunConfig, results: Sequence[Result], chosen: bool) -> str:
     sentences = []
     if chosen and config.eval_every:
         varied = any(config.conditions(stage) for stage in range(1, len(config.ends()) + 1))
-        conditions = " The conditions of those episodes varied, of these they do not." if varied else ""
+        conditions = " Conditions varied in the episodes of training, and do not vary in these." if varied else ""
         sentences.append(
             "Evaluations during training give other numbers: they chose the policy, so the best of them is partly "
             f"luck. This table is of other episodes, from starts that neither trained nor chose the policy.{conditions}"
