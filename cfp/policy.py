@@ -184,7 +184,7 @@ class ActorPolicy(nn.Module, Shareable):
         return action, None if sample.gate is None else sample.gate.cpu().numpy()
 
 
-def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
+def load(path: str | Path, device: str | torch.device = "cpu") -> ActorPolicy:
     """Load a trained policy; nothing is unpickled.
 
     Args:
@@ -251,15 +251,15 @@ def policy_file(path: str | Path) -> Path:
     return file
 
 
-def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_policy(path: str | Path, device: str | torch.device = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by name and description of a policy that `write_policy` wrote; nothing is unpickled."""
     file = policy_file(path)
     try:
-        find_device(device)
+        place = str(find_device(device))
     except ValueError as error:
         raise ConfigError(str(error)) from error
     try:
-        with safetensors.safe_open(file, framework="pt", device=device) as content:
+        with safetensors.safe_open(file, framework="pt", device=place) as content:
             metadata = content.metadata() or {}
             tensors = {name: content.get_tensor(name) for name in content.keys()}
         description = json.loads(metadata.get(FORMAT, "{}"))
