@@ -139,7 +139,7 @@ class ActorPolicy(nn.Module, Shareable):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
-        write_policy(path, self.actor.state_dict(), self.description)
+        write_policy(path, self.actor.state_dict(), self.description, shared=True)
 
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
@@ -309,8 +309,12 @@ def _translated(description: dict[str, Any], words: Mapping[str, str]) -> dict[s
     return {**description, "network": {**network, "encoder": word}}
 
 
-def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
+def write_policy(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any], shared: bool = False
+) -> None:
     """Write a policy of any kind: weights with the description, that of `describe_run` and more, and its JSON.
+
+    For ``shared`` see `cfp.files.write_atomically`.
 
     Raises:
         ConfigError: ``path`` does not end in ``.safetensors``.
@@ -321,8 +325,8 @@ def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], de
     description = _translated(description, {own: word for word, own in _ENCODERS.items()})
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
-    write_atomically(path, lambda file: file.write(content))
-    write_json(path.with_suffix(".json"), description)
+    write_atomically(path, lambda file: file.write(content), shared)
+    write_json(path.with_suffix(".json"), description, shared)
 
 
 def copy_policy(source: str | Path, target: Path) -> None:
