@@ -12,7 +12,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.video import record_policy
-from cfp.experiment.cli import Stopped, keep_memory
+from cfp.experiment.cli import Stopped, keep_memory, printable
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.files import parse_json
 from cfp.hub import Shareable
@@ -135,7 +135,8 @@ def fit(
     command = from_python({"task": task, **options}, None if out is None else _folder("out", out), resume)
     keep_memory()
     try:
-        train(command, "the same call with resume=True continues the run")
+        with printable():
+            train(command, "the same call with resume=True continues the run")
     except Stopped as stopped:
         raise KeyboardInterrupt(str(stopped)) from None
     assert command.out is not None

@@ -9,6 +9,7 @@ which they take their noise, belongs to the whole process.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -223,7 +224,7 @@ def play(
     threads, stop = torch.get_num_threads(), Event()
     workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
     total = (steps or 0) * sum(trial.episodes for trial in trials)
-    bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
+    bar = tqdm(total=total, unit="step", disable=None if total and sys.stderr else True)  # None: if on a terminal
 
     def play_span(trial: Trial, first: int, count: int) -> list[Played]:
         taken = 0

@@ -185,6 +185,11 @@ class StageCallback(BaseCallback):
         self._on_rollout_start()
 
 
+def on_terminal() -> bool:
+    """Whether the standard error is a terminal; programs around this one may have replaced it by anything."""
+    return getattr(sys.stderr, "isatty", lambda: False)()
+
+
 class ProgressBarCallback(StageCallback):
     """Shows on the standard error how far the run has come."""
 
@@ -199,7 +204,8 @@ class ProgressBarCallback(StageCallback):
             initial=self.stage.step,
             desc=f"stage {self.stage.number}",
             unit="step",
-            mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
+            mininterval=0.1 if on_terminal() else 15.0,  # a log file needs fewer lines than a terminal
+            disable=sys.stderr is None,
         )
 
     def _on_step(self) -> bool:

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
@@ -189,7 +190,8 @@ class TrainingRun:
         if best != list(files)[-1]:
             print(f"{best} has the highest mean return; its policy is {files[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
-        print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
+        with matplotlib.style.context("default"):  # not the user's own, which may need LaTeX
+            print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})

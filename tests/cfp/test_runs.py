@@ -1,8 +1,12 @@
 """Training from Python is training from the command line."""
 
+import io
 import signal
+import sys
 from pathlib import Path
 
+import cv2
+import matplotlib
 import pytest
 from short_episodes import HORIZON
 from tiny_runs import TINY, at_step
@@ -32,6 +36,30 @@ def test_fit_is_the_command_line_and_resumes_after_ctrl_c(tmp_path):
     run = cfp.fit("shapematch", steps=30, out=str(folder), resume=True, **OPTIONS | short)
     assert [row["step"] for row in read_table(folder / "progress.csv")] == ["10", "20", "30"]
     assert run.folder == folder and run.policy.description["steps"] == 30
+
+
+class Bare:
+    """A standard error that can do no more than Python asks for."""
+
+    write = flush = staticmethod(lambda *text: None)
+
+
+@pytest.mark.parametrize("error", [Bare(), None])
+def test_a_run_ends_with_its_page_whatever_is_around_it(error, tmp_path, monkeypatch):
+    """Output in ASCII, figures of LaTeX, an ffmpeg that does not start, and little or no standard error."""
+    output = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(sys, "stderr", error)
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
+    monkeypatch.setitem(matplotlib.rcParams, "figure.facecolor", "red")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    short = {"eval_every": 10, "eval_episodes": 2, "resolutions": [4], "handover": [], "video": True}
+    cfp.fit("shapematch", steps=20, out=tmp_path / "run", **OPTIONS | short)
+    assert (tmp_path / "run" / "index.html").exists() and (tmp_path / "run" / "replay.html").exists()
+    assert cv2.imread(str(tmp_path / "run" / "curve.png"))[0, 0].tolist() == [255, 255, 255]
+    output.flush()
+    text = output.buffer.getvalue().decode("ascii")
+    assert "\\xb1" in text and "no video: " in text and output.errors == "strict"
 
 
 def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
