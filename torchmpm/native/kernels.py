@@ -110,7 +110,9 @@ class Kernels:
         limit = substeps
         if torch.is_grad_enabled():  # a piece keeps its start, and needs a tape of all its substeps later
             inputs, limit = tree.without_inference(inputs), self.tape_limit(inputs.components, segment)
-        elif not inputs.components.is_cuda:  # Python hears of Ctrl-C between calls, which take some tenths of a second
+        taped = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+        if not taped and not inputs.components.is_cuda:
+            # Python hears of Ctrl-C between calls, which take some tenths of a second.
             rounds = math.ceil(state.batch_size / torch.get_num_threads())
             limit = max(MIN_SUBSTEPS, self.tape_limit(inputs.components[:, :1]) // rounds)
         for start in range(0, substeps, limit):
