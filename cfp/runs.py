@@ -18,7 +18,7 @@ from cfp.evaluation.page import draw_curve
 from cfp.evaluation.returns import REPLAYED
 from cfp.evaluation.video import record_policy
 from cfp.experiment.callbacks import OnEvaluation
-from cfp.experiment.cli import Stopped, keep_memory
+from cfp.experiment.cli import Stopped, keep_memory, printable
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.files import parse_json
 from cfp.hub import Shareable
@@ -186,7 +186,7 @@ def fit(
     command = from_python({"task": task, **options}, None if out is None else _folder("out", out), resume)
     keep_memory()
     try:
-        with messages.quiet(quiet):
+        with printable(), messages.quiet(quiet):
             train(command, "the same call with resume=True continues the run", on_evaluation)
     except Stopped as stopped:
         raise KeyboardInterrupt(str(stopped)) from None

@@ -72,7 +72,7 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
 def save_media(
     recording: Recording, paths: Mapping[str, Path | None], output: TextIO | None = None, **options: Any
 ) -> None:
-    """Write an episode to files and print their names; without the packages that an MP4 needs, print how to get them.
+    """Write an episode to files and print their names; where MP4 cannot be written, print why.
 
     Args:
         recording: The episode.

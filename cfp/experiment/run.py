@@ -8,6 +8,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
@@ -203,7 +204,8 @@ class TrainingRun:
         if best != list(shown)[-1]:
             say(f"{best} has the highest mean return; its policy is {shown[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
-        write_figure(self.folder / "curve.png", draw_curve(self.folder, self.config, untrained))
+        with matplotlib.style.context("default"):  # not the user's own, which may need LaTeX
+            write_figure(self.folder / "curve.png", draw_curve(self.folder, self.config, untrained))
         say(f"learning curve: {self.folder / 'curve.png'}")
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])

@@ -1,8 +1,12 @@
 """Training from Python is training from the command line."""
 
+import io
 import signal
+import sys
 from pathlib import Path
 
+import cv2
+import matplotlib
 import pytest
 from short_episodes import HORIZON
 from tiny_runs import TINY, assert_same_run, at_step
@@ -55,6 +59,30 @@ def test_a_training_is_quiet_if_asked_to_and_can_be_ended_by_its_evaluations(fin
     assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
     assert_same_run(folder, finished)
     assert capfd.readouterr() == ("", "")
+
+
+class Bare:
+    """A standard error that can do no more than Python asks for."""
+
+    write = flush = staticmethod(lambda *text: None)
+
+
+@pytest.mark.parametrize("error", [Bare(), None])
+def test_a_run_ends_with_its_page_whatever_is_around_it(error, tmp_path, monkeypatch):
+    """Output in ASCII, figures of LaTeX, an ffmpeg that does not start, and little or no standard error."""
+    output = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(sys, "stderr", error)
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
+    monkeypatch.setitem(matplotlib.rcParams, "figure.facecolor", "red")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    short = {"eval_every": 10, "eval_episodes": 2, "resolutions": [4], "handover": [], "video": True}
+    cfp.fit("shapematch", steps=20, out=tmp_path / "run", **OPTIONS | short)
+    assert (tmp_path / "run" / "index.html").exists() and (tmp_path / "run" / "replay.html").exists()
+    assert cv2.imread(str(tmp_path / "run" / "curve.png"))[0, 0].tolist() == [255, 255, 255]
+    output.flush()
+    text = output.buffer.getvalue().decode("ascii")
+    assert "\\xb1" in text and "no video: " in text and output.errors == "strict"
 
 
 def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
