@@ -3,11 +3,19 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from baselines.registry import ALGORITHMS as ALGORITHMS
-    from baselines.registry import load as load
-    from baselines.runs import Run as Run
-    from baselines.runs import fit as fit
+if TYPE_CHECKING:  # for editors
+    from baselines.common.open_loop import OpenLoop
+    from baselines.distillation.learner import Distill, DistillConfig
+    from baselines.modular.learner import ModularConfig
+    from baselines.modular.networks import SegmentPolicy
+    from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
+    from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
+    from baselines.planning.mpc import CEM, MPC, CEMConfig, MPCConfig
+    from baselines.registry import ALGORITHMS, load
+    from baselines.runs import Run, fit
+    from baselines.shac import Shac, ShacConfig, StatePolicy
+    from baselines.trajectory import Gradient, GradientConfig
+    from cfp.learner import Learner
 
 #: Where each public name is; its module is imported when it is used, so that ``torchmpm --help`` is quick.
 _MODULES = {
@@ -36,7 +44,31 @@ _MODULES = {
     "load": "baselines.registry",
 }
 
-__all__ = [*_MODULES]
+__all__ = [
+    "ALGORITHMS",
+    "CEM",
+    "MPC",
+    "CEMConfig",
+    "CEMPlanner",
+    "CEMPlannerConfig",
+    "Distill",
+    "DistillConfig",
+    "Gradient",
+    "GradientConfig",
+    "GradientPlanner",
+    "GradientPlannerConfig",
+    "Learner",
+    "MPCConfig",
+    "ModularConfig",
+    "OpenLoop",
+    "Run",
+    "SegmentPolicy",
+    "Shac",
+    "ShacConfig",
+    "StatePolicy",
+    "fit",
+    "load",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -44,3 +76,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'baselines' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

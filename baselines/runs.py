@@ -29,7 +29,8 @@ def fit(
         steps: Environment steps, for algorithms with this option; None: those of the preset.
         out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
         resume: Continue the run in the folder.
-        options: Options of the command line with underscores; ``torchmpm train --algo NAME --help`` lists them.
+        options: ``quiet``, ``on_evaluation``, and options of the command line with underscores, which ``torchmpm train
+            --algo NAME --help`` lists.
 
     Returns:
         The finished run.

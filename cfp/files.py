@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+from uuid import uuid4
 
 from cfp.errors import ConfigError
 
@@ -22,11 +23,11 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool 
     Args:
         path: The file.
         write: Writes its content.
-        shared: Other processes may write it at the same time. Otherwise what a killed program has left of the file
-            aside is overwritten.
+        shared: Others may write it at the same time. Otherwise what a killed program has left of the file aside is
+            overwritten.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f"{path.name}.{os.getpid()}.part" if shared else f"{path.name}.part")
+    aside = path.with_name(f"{path.name}.{uuid4().hex[:8]}.part" if shared else f"{path.name}.part")
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
         with names_file(path), open(aside, "xb") as file:

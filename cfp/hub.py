@@ -55,6 +55,17 @@ class Shareable:
 
     description: dict[str, Any]
 
+    @property
+    def resolution(self) -> int:
+        """Rows and columns of its actions."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """What it is for and comes from, as far as that is known; the weights would fill pages."""
+        about = {**self.description, "resolution": self.resolution}
+        shown = [f"{name}={about[name]!r}" for name in ("task", "resolution", "steps", "seed") if name in about]
+        return f"{type(self).__name__}({', '.join(shown)})"
+
     def save(self, path: Path) -> None:
         """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
         raise NotImplementedError

@@ -117,6 +117,7 @@ class ActorPolicy(nn.Module, Shareable):
     """
 
     uses_image = True
+    __repr__ = Shareable.__repr__  # that of a module lists every layer
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False, actor: Actor | None = None) -> None:
         super().__init__()
@@ -139,7 +140,7 @@ class ActorPolicy(nn.Module, Shareable):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
-        write_policy(path, self.actor.state_dict(), self.description)
+        write_policy(path, self.actor.state_dict(), self.description, shared=True)
 
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
@@ -184,7 +185,7 @@ class ActorPolicy(nn.Module, Shareable):
         return action, None if sample.gate is None else sample.gate.cpu().numpy()
 
 
-def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
+def load(path: str | Path, device: str | torch.device = "cpu") -> ActorPolicy:
     """Load a trained policy; nothing is unpickled.
 
     Args:
@@ -251,15 +252,15 @@ def policy_file(path: str | Path) -> Path:
     return file
 
 
-def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_policy(path: str | Path, device: str | torch.device = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by name and description of a policy that `write_policy` wrote; nothing is unpickled."""
     file = policy_file(path)
     try:
-        find_device(device)
+        place = str(find_device(device))
     except ValueError as error:
         raise ConfigError(str(error)) from error
     try:
-        with safetensors.safe_open(file, framework="pt", device=device) as content:
+        with safetensors.safe_open(file, framework="pt", device=place) as content:
             metadata = content.metadata() or {}
             tensors = {name: content.get_tensor(name) for name in content.keys()}
         description = json.loads(metadata.get(FORMAT, "{}"))
@@ -309,8 +310,12 @@ def _translated(description: dict[str, Any], words: Mapping[str, str]) -> dict[s
     return {**description, "network": {**network, "encoder": word}}
 
 
-def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
+def write_policy(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any], shared: bool = False
+) -> None:
     """Write a policy of any kind: weights with the description, that of `describe_run` and more, and its JSON.
+
+    For ``shared`` see `cfp.files.write_atomically`.
 
     Raises:
         ConfigError: ``path`` does not end in ``.safetensors``.
@@ -321,8 +326,8 @@ def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], de
     description = _translated(description, {own: word for word, own in _ENCODERS.items()})
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
-    write_atomically(path, lambda file: file.write(content))
-    write_json(path.with_suffix(".json"), description)
+    write_atomically(path, lambda file: file.write(content), shared)
+    write_json(path.with_suffix(".json"), description, shared)
 
 
 def copy_policy(source: str | Path, target: Path) -> None:

@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from cfp.config import RunConfig, update_from_dict
 from cfp.envs.make import gpu_memory
 from cfp.errors import ConfigError
@@ -51,7 +53,7 @@ def configure(values: dict[str, Any]) -> RunConfig:
     return update_from_dict(defaults if memory == 0 else for_gpu(defaults, memory), values)
 
 
-def load(path: str | Path, device: str = "cpu") -> Policy:
+def load(path: str | Path, device: str | torch.device = "cpu") -> Policy:
     """Load a trained policy of any algorithm; nothing is unpickled.
 
     Args:
@@ -67,7 +69,7 @@ def load(path: str | Path, device: str = "cpu") -> Policy:
         ConfigError: It is of an algorithm that is not known here.
     """
     file = policy_file(path)
-    return find(algo_of(read_policy(file)[1])).load_policy(file, device)
+    return find(algo_of(read_policy(file)[1])).load_policy(file, str(device))
 
 
 def algo_of(description: Mapping[str, Any]) -> str:

@@ -155,7 +155,8 @@ class Evaluation:
             seed=SEED,
             conditions=conditions,
         )
-        result = evaluate([trial], self.config.make_spec().horizon)[0]
+        name = f"{self.name}, {self.case}, {self.particles}"
+        result = evaluate([trial], self.config.make_spec().horizon, name=name)[0]
         return self.head | _numbers(result)
 
 
@@ -254,7 +255,7 @@ def run(command: Command) -> None:
             rows |= read_rows(command.rows)  # to which another program may have added some
             rows = {other: found for other, found in rows.items() if not _is_of_another_file(found, row)} | {key: row}
             if command.rows is not None:
-                write_text(command.rows, csv_text(rows.values(), COLUMNS))
+                write_text(command.rows, csv_text(rows.values(), COLUMNS), shared=True)
         print(make_table([rows[key] for key in keys], list(rows.values())).to_markdown(), flush=True)
 
 

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
 
-from cfp import registry
-from cfp.config import RunConfig
+from cfp import messages, registry
+from cfp.config import Particles, Preset, RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
+from cfp.evaluation.page import draw_curve
+from cfp.evaluation.returns import REPLAYED
 from cfp.evaluation.video import record_policy
-from cfp.experiment.cli import Stopped, keep_memory
+from cfp.experiment.callbacks import OnEvaluation
+from cfp.experiment.cli import Stopped, keep_memory, printable
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.files import parse_json
 from cfp.hub import Shareable
@@ -88,7 +94,23 @@ class Run:
         return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.folder)!r})"
+        """Folder, task, action grid of the last stage, and the mean return of its policy, once the run is finished."""
+        config, returned = self.config, ""
+        with suppress(CheckpointError):
+            last = [row for row in self.results if row["policy"] != REPLAYED][-1]
+            returned = f", mean_return={last['mean']:.1f}"
+        resolution = config.resolution(len(config.ends()))
+        about = f"{str(self.folder)!r}, task={config.task!r}, resolution={resolution}{returned}"
+        return f"{type(self).__name__}({about})"
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: the learning curve, also of a run in training."""
+        baselines: dict[str, float] = {}
+        with suppress(CheckpointError):
+            baselines = {row["policy"]: row["mean"] for row in self.results[:2]}
+        picture = BytesIO()
+        draw_curve(self.folder, self.config, baselines).savefig(picture, format="png", dpi=100)
+        return picture.getvalue()
 
 
 def _folder(name: str, given: Any) -> Path:
@@ -101,23 +123,50 @@ def _folder(name: str, given: Any) -> Path:
 def fit(
     task: str,
     *,
+    algo: str | None = None,
+    preset: Preset | None = None,
     steps: int | None = None,
+    seed: int | None = None,
+    num_envs: int | None = None,
+    particles: Particles | None = None,
+    resolutions: Sequence[int] | None = None,
+    start_from: str | os.PathLike[str] | None = None,
+    eval_every: int | None = None,
+    eval_episodes: int | None = None,
+    video: bool | None = None,
+    device: str | None = None,
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    quiet: bool = False,
+    on_evaluation: OnEvaluation | None = None,
     **options: Any,
 ) -> Run:
     """Train a policy, as ``torchmpm train`` does, with the same folder of the run.
 
-    Ctrl-C writes a checkpoint and raises `KeyboardInterrupt`; the same call with ``resume=True`` continues. On Linux
-    glibc keeps freed memory from then on, which makes updates of the networks a third faster.
+    Options that are not given, or None, have the values of `cfp.preset`. Ctrl-C writes a checkpoint and raises
+    `KeyboardInterrupt`; the same call with ``resume=True`` continues. On Linux glibc keeps freed memory from then on,
+    which makes updates of the networks a third faster.
 
     Args:
         task: Task, or ``"MODULE:NAME"`` for a custom one.
-        steps: Environment steps of all stages together; None: those of the preset.
+        algo: ``"cfp-analytic"`` or ``"cfp-sac"``, None: that of the preset; `baselines.fit` has others.
+        preset: ``"quick"``, ``"long"`` or ``"paper"``; None: quick.
+        steps: Environment steps of all stages together.
+        seed: Of everything that is random; None: 0.
+        num_envs: Robots simulated side by side.
+        particles: ``"full"`` (the paper's), ``"lite"`` (about 2,000), a number, or those of robot and object.
+        resolutions: Action grid R of each stage.
+        start_from: A trained policy for the first stages.
+        eval_every: Environment steps between evaluations; 0: none.
+        eval_episodes: Episodes of an evaluation and of the final table.
+        video: Whether to record a video at the end.
+        device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
         out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
         resume: Continue the run in the folder.
-        options: Options of the command line with underscores, such as ``seed=1``, ``particles=500``,
-            ``handover=(0.5,)`` or ``video=False``.
+        quiet: Print nothing, and show no progress bar.
+        on_evaluation: Called with each new row of ``evaluations.csv``, see `Run.evaluations`. An exception that it
+            raises ends the training and comes out here; the run can be resumed from its last checkpoint.
+        options: All further ones of the command line, with underscores, such as ``handover=(0.5,)``.
 
     Returns:
         The finished run.
@@ -128,15 +177,22 @@ def fit(
         CFPError: Another process trains in the folder.
         NonFiniteError: Training has diverged.
     """
-    if steps is not None:
-        options["steps"] = steps
-    if not isinstance(resume, bool):
-        raise ConfigError(f"resume must be True or False, got {resume!r}")
+    options |= _given(algo=algo, preset=preset, steps=steps, seed=seed, num_envs=num_envs, particles=particles)
+    options |= _given(resolutions=resolutions, start_from=start_from, video=video, device=device)
+    options |= _given(eval_every=eval_every, eval_episodes=eval_episodes)
+    for name, flag in (("resume", resume), ("quiet", quiet)):
+        if not isinstance(flag, bool):
+            raise ConfigError(f"{name} must be True or False, got {flag!r}")
     command = from_python({"task": task, **options}, None if out is None else _folder("out", out), resume)
     keep_memory()
     try:
-        train(command, "the same call with resume=True continues the run")
+        with printable(), messages.quiet(quiet):
+            train(command, "the same call with resume=True continues the run", on_evaluation)
     except Stopped as stopped:
         raise KeyboardInterrupt(str(stopped)) from None
     assert command.out is not None
     return Run(command.out)
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}

@@ -92,6 +92,18 @@ class Column:
             return "–"
         return value if isinstance(value, str) else format(value, self.format)
 
+    def html(self, row: Row | None = None) -> str:
+        """The cell of a row, or without one the cell of the title.
+
+        Its class tells apart texts, which are aligned to the left, and values that do not exist. Its data-title is
+        shown on narrow screens, see ``STYLE`` in `cfp.evaluation.page`.
+        """
+        kind = "number" if self.format else "text"
+        if row is None:
+            return f'<th class="{kind}">{escape(self.title)}</th>'
+        kind = "none" if row.get(self.key) is None else kind
+        return f'<td class="{kind}" data-title="{escape(self.title)}">{escape(self.text(row))}</td>'
+
 
 def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
     """Several columns of one format, as ``key="title"``."""
@@ -130,14 +142,9 @@ class Table:
     def to_html(self) -> str:
         """Heading, description and visible columns."""
         head = f"<h2>{escape(self.title)}</h2>\n"
-        head += f"<p>{escape(self.description)}</p>\n" if self.description else ""
+        head += f'<p class="note">{escape(self.description)}</p>\n' if self.description else ""
         if not self.rows:
             return head
-        rows = ["".join(_html_cell("th", column, column.title) for column in self.visible)]
-        rows += ["".join(_html_cell("td", column, column.text(row)) for column in self.visible) for row in self.rows]
-        return f"{head}<div class='wide'><table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table></div>"
-
-
-def _html_cell(tag: str, column: Column, text: str) -> str:
-    alignment = "" if column.format else ' class="text"'
-    return f"<{tag}{alignment}>{escape(text)}</{tag}>"
+        titles, *rows = ("".join(column.html(row) for column in self.visible) for row in (None, *self.rows))
+        body = "\n".join(f"<tr>{row}</tr>" for row in rows)
+        return f'{head}<div class="wide"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'

@@ -20,10 +20,12 @@ import dittogym
 from cfp import registry
 from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
+from cfp.experiment.callbacks import OnEvaluation
 from cfp.experiment.cli import Stopped, StopSignals, program_name, read_command, run_command
 from cfp.experiment.folder import Folder, folder_option, holds_run, read_config, run_lock
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
+from cfp.messages import say
 
 #: How the coarse-to-fine policy learns.
 Learner: TypeAlias = Literal["analytic", "sac"]
@@ -138,8 +140,14 @@ def main(arguments: Sequence[str] | None = None, module: str = "cfp.train") -> i
     return run_command(run)
 
 
-def train(command: Command, hint: str) -> None:
-    """Train, or resume, the run that a completed command describes; ``hint`` tells how to resume it once stopped."""
+def train(command: Command, hint: str, on_evaluation: OnEvaluation | None = None) -> None:
+    """Train, or resume, the run that a completed command describes.
+
+    Args:
+        command: The command.
+        hint: How to resume the run once it is stopped.
+        on_evaluation: Called with each row of ``evaluations.csv``.
+    """
     folder, config = command.out, command.run
     assert folder is not None
     if folder.exists() and not folder.is_dir():
@@ -149,11 +157,11 @@ def train(command: Command, hint: str) -> None:
         print(json.dumps(dataclasses.asdict(config), indent=2))
         return
     if command.resume and not holds_run(folder):
-        print(f"{folder} holds no run yet: starting a new one")
+        say(f"{folder} holds no run yet: starting a new one")
     with run_lock(folder):
         with StopSignals() as signals:
-            run = TrainingRun(registry.find(config.algo), config, folder, command.resume, signals)
-            print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
+            run = TrainingRun(registry.find(config.algo), config, folder, command.resume, signals, on_evaluation)
+            say(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
             try:
                 run.train()
             except Stopped as stopped:

@@ -58,6 +58,11 @@ class EnvState:
     steps: Tensor
     conditions: Drawn = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Particles in short, and the fewest and the most steps of the batch; the numbers would fill pages."""
+        low, high = f"{self.steps.min()}", f"{self.steps.max()}"
+        return f"{type(self).__name__}({self.particles!r}, steps={low if low == high else f'{low} to {high}'})"
+
     def __getstate__(self) -> dict[str, Any]:
         """The fields, for pickles and deep copies, which cannot hold an autograd graph."""
         tree.refuse_graph("the state of a TorchEnv", self)

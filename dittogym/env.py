@@ -64,8 +64,13 @@ def as_numpy(value: torch.Tensor | dict[str, Any]) -> Any:
 
 
 def first(value: Any) -> Any:
-    """The first element of an array, or of all in an ``info``; numbers come out as NumPy scalars."""
-    return {name: entry[0] for name, entry in value.items()} if isinstance(value, dict) else value[0]
+    """The first element of an array, or of all in an ``info``; numbers come out as NumPy scalars.
+
+    Truth values are Python's own, as Gymnasium's wrappers take NumPy's for objects that they do not know.
+    """
+    if isinstance(value, dict):
+        return {name: first(entry) for name, entry in value.items()}
+    return bool(value[0]) if isinstance(value[0], np.bool_) else value[0]
 
 
 class Shell:
@@ -175,8 +180,8 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
             action: (2, R, R) in [-1, 1].
 
         Returns:
-            Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays and NumPy scalars;
-            the reward terms have keys such as ``"reward_terms/velocity"``.
+            Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays, NumPy scalars and
+            truth values of Python; the reward terms have keys such as ``"reward_terms/velocity"``.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)

@@ -6,13 +6,17 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from uuid import uuid4
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file beside ``path``, with its suffix, to write to; it takes its place at the end, and after an error goes."""
+    """A file beside ``path``, with its suffix, to write to; it takes its place at the end, and after an error goes.
+
+    Others may write the same file meanwhile: the last one that ends replaces the rest.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}.part{path.suffix}")
+    aside = path.with_name(f".{path.stem}.{uuid4().hex[:8]}.part{path.suffix}")
     try:
         aside.touch()  # names the file where it cannot be written; what ffmpeg says is a page long
         yield aside

@@ -216,7 +216,7 @@ def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor
     """
     if not boxes:
         return None
-    pixels = torch.arange(SIZE * BLOCK, device=origin.device)
+    pixels = torch.arange(SIZE * BLOCK, dtype=origin.dtype, device=origin.device)
     x = (column + pixels) / RASTER + origin[:, 0:1]
     y = (RASTER - row - pixels) / RASTER + origin[:, 1:2]
     across = torch.stack([_between(x, box.left, box.right, box.closed) for box in boxes], dim=1)
@@ -308,7 +308,7 @@ def splat_means(shown: RasterInput) -> Tensor:
 def _splat_weights(shown: RasterInput) -> tuple[Tensor, Tensor]:
     """Weights (B, 9, N) of the pixels around each particle, and their indices (B, 9 N) in the framed image."""
     x, y = shown.position.unbind(-1)
-    corner, width = torch.stack((shown.column, shown.row)), SIZE + 2 * FRAME
+    corner, width = torch.stack((shown.column, shown.row)).to(x), SIZE + 2 * FRAME
     at = torch.stack((x, 1.0 - y)) * (RASTER / BLOCK) - corner / BLOCK - 0.5  # (2, B, N) pixels rightwards, downwards
     middle, reach = 0.5 * SIZE, 0.5 * SIZE + 1.5
     near = shown.visible & ((at - middle).abs() < reach).all(0)

@@ -30,6 +30,10 @@ class Snapshot:
     observation: Tensor
     constants: Mapping[str, str]
 
+    def __repr__(self) -> str:
+        """Task and state; the rest would fill pages."""
+        return f"{type(self).__name__}({self.constants['task']}, {self.state!r})"
+
 
 torch.serialization.add_safe_globals([Snapshot, EnvState, Features])  # tensors, numbers and a name
 

@@ -135,6 +135,11 @@ class TaskSpec:
             if not callable(given := getattr(self, name)):
                 raise TypeError(f"{name} must be a function of a Transition and a TaskSpec, got {given!r}")
 
+    def __repr__(self) -> str:
+        """What tells tasks apart at a glance; `dataclasses.asdict` shows all fields."""
+        sizes = f"horizon={self.horizon}, coarse={self.coarse}, fine={self.fine}"
+        return f"{type(self).__name__}({self.name!r}, {sizes}, terms={[*self.weights]})"
+
     def _check_numbers(self) -> None:
         for name, value in self.weights.items():
             # Tearing and actions are costs, whose terms are negative.

@@ -474,8 +474,16 @@ class TorchEnv:
         return film(self, as_function(policy, self.action_layout), path, seed, index, **options)
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows: the first simulation, once there is a state."""
-        return None if self._env_state is None else png(self.render())
+        """What a notebook shows once there is a state: all simulations, row by row."""
+        if self._env_state is None:
+            return None
+        columns = math.ceil(math.sqrt(self.num_envs))
+        size, rows = max(16, min(512, 1024 // columns)), math.ceil(self.num_envs / columns)
+        sheet = np.full((rows, size + 2, columns, size + 2, 3), 255, np.uint8)  # with a white line between them
+        for index in range(self.num_envs):
+            row, column = divmod(index, columns)
+            sheet[row, :size, column, :size] = self.render(index, size=size)
+        return png(sheet.reshape(rows * (size + 2), columns * (size + 2), 3))
 
 
 def find_resolution(spec: TaskSpec, resolution: str | int, name: str = "resolution") -> int:

@@ -197,6 +197,9 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """A picture (S, S, 3) uint8 of ``render_size`` S of each simulation in mode ``"rgb_array"``, else nothing."""
         return None if self.render_mode is None else tuple(map(self._picture, range(self.num_envs)))
 
+    def _repr_png_(self) -> bytes | None:
+        return self.torch_env._repr_png_()
+
 
 def _array(values: Any) -> np.ndarray:
     return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)

@@ -12,12 +12,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 #: What each script prints, and the modules that it needs.
 SCRIPTS = {
-    "sb3_ppo": (r"64 steps, actions \(2, 2, 8, 8\)", "stable_baselines3"),
+    "sb3_ppo": (r"64 steps, 4 returns, actions \(2, 2, 8, 8\)", "stable_baselines3"),
     "sb3_contrib_tqc": (r"16 steps, [1-9]\d* updates, actions \(2, 2, 8, 8\)", "sb3_contrib"),
     "ppo_torch": (r"iteration 2: mean reward -?\d", "torch"),
     "torchrl_gym_env": (r"5 steps, images \(5, 3, 64, 64\), actions \(5, 2, 8, 8\)", "torchrl"),
     "rllib_ppo": (r"64 steps, loss of the policy -?\d", "ray tree"),
     "optuna_study": (r"0\.\d+ m with \{'frequency'", "optuna"),
+    "optuna_pruning": (r"\d of 6 trainings pruned; best return -?\d", "optuna"),
     "async_vector_env": (r"fork: rewards (.*)\nforkserver: rewards \1\nspawn: rewards \1", "torch"),
     "func_transforms": (r"width per Pa: -\d", "torch"),
     "checkpoint_steps": (r"gradients \(4, 1, 2, 8, 8\) are equal, norm \d", "torch"),

@@ -58,6 +58,12 @@ def test_docstrings_mention_the_arguments(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
+def test_completion_lists_every_public_name(package: str) -> None:
+    module = importlib.import_module(package)
+    assert {*module.__all__} <= {*dir(module)}  # also what is imported on first use
+
+
+@pytest.mark.parametrize("package", PACKAGES)
 def test_the_reference_shows_every_public_name(package: str) -> None:
     page = (REFERENCE / f"{package}.md").read_text()
     shown = set(re.findall(r"^\.\. (?:auto|py:)\w+:: (\S+)", page, flags=re.MULTILINE))

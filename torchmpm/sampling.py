@@ -36,7 +36,9 @@ def sobol(count: int, seed: int) -> Points:
     checks.whole("count", count, 1, LARGEST)
     leave_parent_threads()
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
-    return engine.draw(count, dtype=torch.float64).numpy()
+    points = engine.draw(count, dtype=torch.float64).numpy()
+    points[0] = points[0].astype(np.float32)  # as the engine rounds it unless torch's default is double precision
+    return points
 
 
 def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float]) -> Points:

@@ -70,6 +70,11 @@ class ParticleState:
                     f"{name} is {field.dtype} on {field.device}, but x is {self.x.dtype} on {self.x.device}"
                 )
 
+    def __repr__(self) -> str:
+        """Sizes, type and device; the numbers would fill pages."""
+        sizes = f"batch_size={self.batch_size}, num_particles={self.num_particles}"
+        return f"{type(self).__name__}({sizes}, dtype={self.dtype}, device={str(self.device)!r})"
+
     @classmethod
     def at_rest(cls, x: Float[Tensor, "*B N 2"]) -> ParticleState:
         """Undeformed particles without velocity: v = C = 0, F = I, Jp = 1.

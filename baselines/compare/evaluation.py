@@ -35,7 +35,7 @@ class Protocol:
 def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> list[Played]:
     """Play an episode of a policy on each of some consecutive layouts in the environment of a run's options."""
     trial = make_trial(config, "", policy, len(layouts), deterministic=deterministic, seed=layouts[0])
-    return play([trial])[0]
+    return play([trial], config.make_spec().horizon)[0]
 
 
 def identity(run: Run) -> str:

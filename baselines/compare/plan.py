@@ -73,7 +73,7 @@ class Run:
     def error(self) -> str:
         """Why the last attempt failed; empty if it did not."""
         path = self.folder / "error.txt"
-        return path.read_text().strip() if path.exists() else ""
+        return path.read_text(encoding="utf-8").strip() if path.exists() else ""
 
     @property
     def trained(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 from baselines.compare.evaluation import Protocol, read_evaluation
 from baselines.compare.plan import Run
 from cfp.evaluation.page import STYLE, write_figure
-from cfp.evaluation.returns import t_interval
+from cfp.evaluation.returns import PLAN, REPLAYED, t_interval
 from cfp.files import write_text
 from cfp.learner import Sees
 from cfp.tables import Table, columns, csv_text, read_table
@@ -105,29 +106,39 @@ def observes(group: Sequence[Result]) -> str:
     return str(group[0].evaluation["observes"])
 
 
+def scores_by_name(group: Sequence[Result]) -> dict[str, dict[int, float]]:
+    """Scores by seed under each name that an algorithm is shown by: a plan has two, see `REPLAYED`."""
+    label, scores = group[0].run.label, {result.run.seed: result.score for result in group}
+    evaluations = {result.run.seed: result.evaluation or {} for result in group}
+    plans = {seed: found["own_layout"] for seed, found in evaluations.items() if found.get("own_layout") is not None}
+    return {f"{label}: {PLAN}": plans, f"{label}: {REPLAYED}": scores} if plans else {label: scores}
+
+
 def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Table:
     """The table: an algorithm on a task in each row, with its difference to the ``first`` algorithm."""
     rows, groups = [], grouped(results)
     for (task, label), group in groups.items():
-        scores = {result.run.seed: result.score for result in group}
-        row: dict[str, Any] = {"task": task, "observes": observes(group), "algorithm": label, "seeds": len(group)}
-        row |= {"mean": float(np.mean([*scores.values()])), "interval": t_interval([*scores.values()])}
-        if label != first and (task, first) in groups:
-            theirs = {result.run.seed: result.score for result in groups[task, first]}
-            mine = dict.fromkeys(theirs, *scores.values()) if group[0].run.reference else scores
-            if groups[task, first][0].run.reference:
-                theirs = dict.fromkeys(mine, *theirs.values())
-            if differences := paired_differences(mine, theirs):
-                row |= {"difference": float(np.mean(differences)), "difference_interval": t_interval(differences)}
         found = [result.evaluation for result in group if result.evaluation is not None]
         successes = [success for each in found for success in each["successes"] if success is not None]
-        own = [each["own_layout"] for each in found if each["own_layout"] is not None]
         ends = [result.curve[0][-1] for result in group if len(result.curve[0])]
         minutes = [result.run.record["seconds"] / 60 for result in group if "seconds" in result.run.record]
-        row |= {"episodes": sum(len(each["returns"]) for each in found)}
-        for name, values in (("success", successes), ("own", own), ("minutes", minutes)):
-            row[name] = float(np.mean(values)) if values else None
-        rows.append(row | {"steps": int(max(ends)) if ends else None})
+        for name, scores in scores_by_name(group).items():
+            row: dict[str, Any] = {"task": task, "observes": observes(group), "algorithm": name, "seeds": len(scores)}
+            row |= {"mean": float(np.mean([*scores.values()])), "interval": t_interval([*scores.values()])}
+            row |= {"steps": int(max(ends)) if ends else None, "minutes": float(np.mean(minutes)) if minutes else None}
+            rows.append(row)
+            if name == f"{label}: {PLAN}":  # one episode for each seed, which no other algorithm plays
+                row["episodes"] = len(scores)
+                continue
+            row["episodes"] = sum(len(each["returns"]) for each in found)
+            row["success"] = float(np.mean(successes)) if successes else None
+            if label != first and (task, first) in groups:
+                theirs = {result.run.seed: result.score for result in groups[task, first]}
+                mine = dict.fromkeys(theirs, *scores.values()) if group[0].run.reference else scores
+                if groups[task, first][0].run.reference:
+                    theirs = dict.fromkeys(mine, *theirs.values())
+                if differences := paired_differences(mine, theirs):
+                    row |= {"difference": float(np.mean(differences)), "difference_interval": t_interval(differences)}
     noise = {
         "paper": "with action noise as in the paper (none in SHAPE MATCH, that of the policy elsewhere)",
         "with": "with action noise",
@@ -137,32 +148,39 @@ def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Tab
         f"Each policy plays the same {protocol.episodes} episodes with {protocol.particles} particles, {noise}, on "
         "layouts that neither trained nor selected it. Return: mean over seeds of the mean over episodes, ± half its "
         f"95 % confidence interval (Student's t over seeds). Difference: to {first}, in pairs of equal seeds; one run "
-        "of a reference policy stands for all seeds. Compare only policies that observe the same. Own layout: the "
-        "return on the only layout that a policy is made for. Minutes: of a training with all its evaluations."
+        "of a reference policy stands for all seeds. Compare only policies that observe the same. A plan is made for "
+        "one start, and its row is of that one. Minutes: of a training with all its evaluations. The curves show other "
+        "episodes, those of the evaluations during training; they chose the policies, so the best of them are partly "
+        "luck."
     )
     shown = (
         *columns(task="task", observes="observes", algorithm="algorithm"),
         *columns("d", seeds="seeds", episodes="episodes"),
         *columns(",.1f", mean="return", interval="± 95 %"),
         *columns("+,.1f", difference="difference"),
-        *columns(",.1f", difference_interval="± 95 %"),
+        *columns(",.1f", difference_interval="its ± 95 %"),
         *columns(".0%", success="success"),
-        *columns(",.1f", own="own layout"),
         *columns(",d", steps="steps"),
         *columns(",.1f", minutes="minutes"),
     )
     return Table("returns", "Returns", description, shown, rows)
 
 
-def draw(results: Sequence[Result]) -> Figure:
-    """For each task: curves of the evaluations during training, and the returns of the evaluated policies."""
+def draw(results: Sequence[Result], columns: int = 2) -> Figure:
+    """For each task: curves of the evaluations during training, and the returns of the evaluated policies.
+
+    Args:
+        results: All runs.
+        columns: 2 puts both pictures of a task beside each other, 1 below each other, for narrow screens.
+    """
     groups = grouped(results)
     tasks, labels = list(dict.fromkeys(task for task, _ in groups)), list(dict.fromkeys(label for _, label in groups))
-    figure = Figure(figsize=(11, 3.6 * max(len(tasks), 1)), dpi=130, layout="constrained")
-    panels = figure.subplots(max(len(tasks), 1), 2, squeeze=False)
+    rows = 2 * max(len(tasks), 1) // columns
+    figure = Figure(figsize=(5.5 * columns, 3.6 * rows), dpi=130, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).reshape(-1, 2)
     for (curves, returns), task in zip(panels, tasks, strict=False):
-        own = [(label, group) for (other, label), group in groups.items() if other == task]
-        for place, (label, group) in enumerate(own):
+        names: list[str] = []
+        for label, group in ((label, group) for (other, label), group in groups.items() if other == task):
             colour, style = f"C{labels.index(label) % 10}", LINES[observes(group)]
             if lines := [result.curve for result in group if len(result.curve[0])]:
                 steps, values = align(lines)
@@ -172,10 +190,12 @@ def draw(results: Sequence[Result]) -> Figure:
                     curves.fill_between(
                         steps, values.mean(0) - half, values.mean(0) + half, color=colour, alpha=0.15, linewidth=0
                     )
-            scores = [result.score for result in group]
-            returns.plot(scores, [place] * len(scores), "o", color=colour, alpha=0.4)
-            returns.errorbar(np.mean(scores), place, xerr=t_interval(scores), fmt="D", color=colour, capsize=4)
-        returns.set_yticks(range(len(own)), [f"{label} ({observes(group)})" for label, group in own])
+            for name, by_seed in scores_by_name(group).items():
+                place, scores = len(names), [*by_seed.values()]
+                returns.plot(scores, [place] * len(scores), "o", color=colour, alpha=0.4)
+                returns.errorbar(np.mean(scores), place, xerr=t_interval(scores), fmt="D", color=colour, capsize=4)
+                names.append("\n".join(textwrap.wrap(f"{name} ({observes(group)})", 30)))
+        returns.set_yticks(range(len(names)), names, fontsize=8)
         returns.invert_yaxis()
         curves.set(title=f"{task}: evaluations during training", xlabel="environment steps", ylabel="return")
         returns.set(title=f"{task}: final evaluation", xlabel="return: seeds, their mean, ± 95 %")
@@ -187,7 +207,7 @@ def draw(results: Sequence[Result]) -> Figure:
 
 
 def write_report(folder: Path, results: Sequence[Result], first: str, protocol: Protocol) -> Path:
-    """Write ``episodes.csv``, ``report.md``, ``returns.png`` and ``index.html``; another process may do the same."""
+    """Write ``episodes.csv``, ``report.md``, ``index.html`` and its pictures; another process may do the same."""
     table, others = make_table(results, first, protocol), [each for each in results if each.state != "finished"]
     state = f"{len(results) - len(others)} of {len(results)} runs are finished and evaluated{':' if others else '.'}"
     if others:
@@ -195,15 +215,17 @@ def write_report(folder: Path, results: Sequence[Result], first: str, protocol: 
     lines = [f"{each.run.name}: {each.state}{f' ({each.run.error})' if each.run.error else ''}" for each in others]
     write_text(folder / "episodes.csv", csv_text(raw_rows(results), RAW), shared=True)
     write_figure(folder / "returns.png", draw(results), shared=True)
+    write_figure(folder / "returns-narrow.png", draw(results, columns=1), shared=True)
     parts = ["# Comparison", state, "\n".join(f"- {line}" for line in lines), table.to_markdown()]
     text = "\n\n".join(part for part in [*parts, "![Learning curves and returns](returns.png)"] if part) + "\n"
     write_text(folder / "report.md", text, shared=True)
     page = f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Comparison</title>
-<style>{STYLE} body {{ max-width: 76rem; }}</style></head><body>
+<style>{STYLE} body {{ max-width: 78rem; }}</style></head><body>
 <h1>Comparison</h1><p>{state}</p><ul>{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>
 {table.to_html()}
-<p><img src="returns.png" alt="Learning curves and returns"></p>
+<picture><source media="(max-width: 48rem)" srcset="returns-narrow.png">
+<img src="returns.png" alt="Learning curves and returns"></picture>
 <p>Every episode: <a href="episodes.csv">episodes.csv</a></p></body></html>
 """
     write_text(folder / "index.html", page, shared=True)

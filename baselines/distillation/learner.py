@@ -41,6 +41,7 @@ from cfp.learner import (
     decompress,
     linear_decay,
 )
+from cfp.messages import say
 from cfp.policy import copy_policy, load, read_policy, shipped
 from cfp.presets import sac_preset
 from dittogym import TorchEnv, make_spec
@@ -475,7 +476,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         chosen = replace(chosen, seed=config.seed, device=config.device, **same)
         algorithm, own = find(config.teacher), folder / "teacher"
         run = TrainingRun(algorithm, chosen, own, True, signals)
-        print(f"training the teacher first: {config.teacher} -> {own}")
+        say(f"training the teacher first: {config.teacher} -> {own}")
         run.train()
         copy_policy(policy_path(own), teacher_path(folder))
 

@@ -86,7 +86,7 @@ class ModularActor(SquashedActor):
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
-        mean, raw_std = self.head(self.trunk(observation)).chunk(2, -1)
+        mean, raw_std = self.head(self.trunk(observation)).float().chunk(2, -1)  # autocast may have reduced it
         return Sample(*sample_squashed_gaussian(mean, raw_std, deterministic), None)
 
 

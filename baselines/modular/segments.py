@@ -58,7 +58,7 @@ def update(x: Tensor, labels: Tensor, count: int) -> Tensor:
     """Segment particles (B, N, 2), m, that have moved, by Lloyd's algorithm from the previous labels (B, N)."""
     for _ in range(LLOYD_ITERATIONS):
         distance, labels = squared_distances(x, segment_means(x, labels, count)[0]).min(-1)
-        sizes = torch.zeros(len(x), count, device=x.device).scatter_add_(1, labels, torch.ones_like(labels).to(x))
+        sizes = x.new_zeros(len(x), count).scatter_add_(1, labels, torch.ones_like(labels).to(x))
         for element, empty in (sizes == 0).nonzero().tolist():  # gets the particle farthest from its centre
             farthest = int(distance[element].argmax())
             labels[element, farthest], distance[element, farthest] = empty, 0.0
@@ -243,7 +243,8 @@ class SegmentedEnv:
         self.env, self.nodes = env, nodes
         self.num_envs, self.device = env.num_envs, env.device
         self.labels = torch.zeros(env.num_envs, env.model.num_robot_particles, dtype=torch.int64, device=env.device)
-        self._observation = torch.zeros(env.num_envs, nodes.count, nodes.num_columns(env.spec), device=env.device)
+        shape = env.num_envs, nodes.count, nodes.num_columns(env.spec)
+        self._observation = torch.zeros(shape, dtype=torch.float32, device=env.device)
 
     @property
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:

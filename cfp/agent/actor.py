@@ -140,12 +140,15 @@ def _channels_last(image: Tensor) -> Tensor:
 
 
 def initialise(module: nn.Module) -> nn.Module:
-    """Initialise linear layers Xavier-uniform with zero bias; convolutions keep PyTorch's default."""
+    """Initialise linear layers Xavier-uniform with zero bias; convolutions keep PyTorch's default.
+
+    Networks are of single precision, as images and rewards are, whatever torch's default is.
+    """
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
-    return module
+    return module.float()
 
 
 def perceptron(*sizes: int, norm: bool = False) -> nn.Sequential:
@@ -270,7 +273,7 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
     the paper's networks by a fifth.
     """
     if not isinstance(heads[0][0], nn.ConvTranspose2d):
-        return [head(latent) for head in heads]
+        return [_precise(head(latent)) for head in heads]
     first, *rest = zip(*heads, strict=True)
     values = F.conv_transpose2d(_channels_last(latent), *_joined(first, 1), first[0].stride, first[0].padding)
     for layers in rest:
@@ -283,7 +286,12 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
         weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
         bias = torch.cat([layer.bias for layer in layers])
         values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
-    return [part.contiguous() for part in values.chunk(len(heads), dim=1)]
+    return [_precise(part).contiguous() for part in values.chunk(len(heads), dim=1)]
+
+
+def _precise(output: Tensor) -> Tensor:
+    """An output in single precision at least, if autocast has reduced it: actions are executed."""
+    return output.to(torch.promote_types(output.dtype, torch.float32))
 
 
 # The small networks.
@@ -616,4 +624,4 @@ def build_actor(spec: ActorSpec) -> Actor:
     actor = Actor(spec.resolutions[0], spec)
     for resolution, bias in zip(spec.resolutions[1:], spec.gate_bias, strict=True):
         actor = ResidualActor(actor, resolution, bias, spec)
-    return actor
+    return actor.float()

@@ -117,7 +117,7 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
     with torch.no_grad():
         last.weight.mul_(0.1)
         last.bias.zero_()
-    return nn.Sequential(*layers, last)
+    return nn.Sequential(*layers, last).float()  # whatever torch's default is
 
 
 def make_adam(parameters: Iterable[nn.Parameter], learning_rate: float, betas: tuple[float, float]) -> torch.optim.Adam:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from torch import Tensor
 import torchmpm
 from cfp.agent.actor import Actor
 from cfp.config import RunConfig, to_json
-from cfp.evaluation.returns import Result, to_rows
+from cfp.evaluation.returns import REPLAYED, Result, to_rows
 from cfp.files import write_atomically, write_text
 from cfp.tables import Table, columns, read_table
 
@@ -30,12 +30,19 @@ PICTURES: dict[str, str] = {
 SIZE = 192  # rows of a picture, pixels
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #282c34; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.7rem; } h2 { font-size: 1.3rem; margin-top: 2rem; } img, video { max-width: 100%; }
-.film { width: 32rem; border-radius: 6px; }
-.wide { overflow-x: auto; } table { border-collapse: collapse; }
-th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #ccc; }
-th.text, td.text { text-align: left; }
-@media (max-width: 40rem) { th, td { padding: 0.2rem 0.25rem; font-size: 0.75rem; } th { white-space: normal; } }
+h1 { font-size: 1.7rem; } h2 { font-size: 1.3rem; margin-top: 2rem; }
+img { display: block; width: 100%; height: auto; margin-top: 1rem; } video { max-width: 100%; }
+.film { width: 32rem; border-radius: 6px; } .note { color: #555; max-width: 60rem; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-size: 0.9rem; }
+th, td { padding: 0.2rem 0.6rem; text-align: right; border-bottom: 1px solid #ccc; }
+th, td { white-space: nowrap; } .text { text-align: left; } td.text { white-space: normal; }
+@media (max-width: 48rem) { /* each row becomes a block of names and values */
+  table, tbody, tr { display: block; } thead, .none { display: none; }
+  tr { columns: 2; padding: 0.5rem 0; border-bottom: 1px solid #ccc; }
+  td { display: flex; justify-content: space-between; gap: 1rem; padding: 0.1rem 0; border: 0; }
+  td.text { column-span: all; text-align: right; font-weight: 600; }
+  td::before { content: attr(data-title); color: #555; font-weight: normal; }
+}
 pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; }
 """
 RESULTS = (
@@ -78,9 +85,15 @@ def _enlarged(pixels: np.ndarray) -> np.ndarray:
 # The learning curve.
 
 
-def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
-    """Draw training and evaluation returns over environment steps into ``curve.png``; returns its path."""
-    figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
+def draw_curve(run: Path, config: RunConfig, baselines: Mapping[str, float]) -> Figure:
+    """Training and evaluation returns over environment steps of the run in a folder, also while it is in training.
+
+    Args:
+        run: The folder.
+        config: Options of the run.
+        baselines: Returns to compare with, by name.
+    """
+    figure = Figure(figsize=(7.2, 4.2), dpi=180, layout="constrained")
     axes = figure.add_subplot()
     training = read_table(run / "progress.csv", ("step", "stage"))
     evaluations = read_table(run / "evaluations.csv", ("step", "mean", "std"))
@@ -104,9 +117,9 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     axes.set(xlabel="environment steps", ylabel="return of an episode")
     axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    write_figure(run / "curve.png", figure)
-    return run / "curve.png"
+    if axes.lines:
+        axes.legend(fontsize=8)
+    return figure
 
 
 def write_figure(path: Path, figure: Figure, shared: bool = False) -> None:
@@ -131,9 +144,24 @@ def _handovers(rows: Sequence[dict[str, str]]) -> list[tuple[int, float]]:
 # The page.
 
 
-def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Path:
-    """Write ``index.html`` beside the files of a finished run that it shows; returns its path."""
-    title = escape(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed}")
+def headline(config: RunConfig, results: Sequence[Result]) -> str:
+    """What a run came to: the return of its last policy, of a plan that on its own start, and of zero action."""
+    last = [result for result in results if result.name != REPLAYED][-1]
+    success = "" if last.success is None else f", success {last.success:.0%}"
+    zero = f"{results[0].name} {results[0].mean:,.0f}"
+    return f"{config.algo} on {config.task}: return {last.mean:,.0f}{success} ({zero})"
+
+
+def write_page(folder: Path, config: RunConfig, results: Sequence[Result], note: str) -> Path:
+    """Write ``index.html`` beside the files of a finished run that it shows; returns its path.
+
+    Args:
+        folder: The folder of the run.
+        config: Its options.
+        results: The final table, zero action first.
+        note: What to say beside the table, see `cfp.evaluation.returns.explain`.
+    """
+    title = escape(headline(config, results))
     film = '<video class="film" src="video.mp4" controls loop muted></video>'
     replay = '<p><a href="replay.html">Replay of this episode</a>, to step through, with other speeds and colours.</p>'
     parts = [
@@ -142,9 +170,10 @@ def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Pa
         f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
         film if (folder / "video.mp4").exists() else "",
         replay if (folder / "replay.html").exists() else "",
-        Table("results", "Final evaluation", "", RESULTS, to_rows(results)).to_html(),
+        Table("results", "Final evaluation", note, RESULTS, to_rows(results)).to_html(),
         '<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps">',
-        f"<h2>Options</h2><p>Trained with torchmpm {torchmpm.__version__}. This command repeats the training:</p>",
+        f"<h2>Options</h2><p>Preset {config.preset}, seed {config.seed}, torchmpm {torchmpm.__version__}. This command "
+        "repeats the training:</p>",
         "<pre>torchmpm train --config config.json --out FOLDER</pre>",
         f"<pre>{escape(json.dumps(to_json(config), indent=2))}</pre></body></html>",
     ]

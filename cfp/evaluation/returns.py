@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from scipy.special import stdtrit  # scipy.stats takes a second to import
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from tqdm import tqdm
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import DIVERGED
 from cfp.errors import NonFiniteError
+from cfp.messages import progress_bar
 from cfp.policy import Memory, Observation, Policy, Start, StatePolicy
 from dittogym import Conditions, TorchEnv
 from dittogym.copies import to_device, to_host
@@ -34,6 +34,8 @@ from dittogym.render.recording import seed_noise
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
+#: How tables name a policy that was made for one start: on that start, and on those of the other policies.
+PLAN, REPLAYED = "plan", "plan, replayed from another start"
 
 
 def evaluation_seed(config: RunConfig) -> int:
@@ -44,6 +46,16 @@ def evaluation_seed(config: RunConfig) -> int:
 def without_noise(policy: Policy, noise: Noise) -> bool:
     """Whether a policy acts without noise."""
     return policy.deterministic_by_default if noise == "default" else noise == "without"
+
+
+def is_plan(policy: Policy) -> bool:
+    """Whether a policy is a plan: actions made for one start, whose seed its description names."""
+    return "layout" in policy.description
+
+
+def name_in_table(name: str, policy: Policy) -> str:
+    """How a table of results names a policy, on starts that are the same for all policies."""
+    return REPLAYED if is_plan(policy) else name
 
 
 def decision_grid(policy: Policy) -> int:
@@ -127,6 +139,7 @@ class Played(NamedTuple):
     torn: bool  # ended by the limit on the robot's spread
     piece: float  # share of the robot in its largest piece after the last step, see `dittogym.pieces`
     mean_piece: float  # over the steps
+    terms: Mapping[str, float] = {}  # the sum of each term of the reward, with its weight; they add up to the total
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +170,7 @@ class Trial:
         memory, starts = None, np.ones(count, bool)
         totals = np.zeros(count, np.float32)  # added up as stable-baselines3 does
         pieces: list[np.ndarray] = []
+        terms: dict[str, np.ndarray] = {}
         played: dict[int, Played] = {}
         while len(played) < count:
             action, memory = acting.predict(as_numpy(observation), memory, starts, deterministic=self.deterministic)
@@ -165,8 +179,11 @@ class Trial:
             with torch.no_grad():
                 observation, *own, info = env.step(to_device(np.array(action, np.float32), env.device))
             found = dict(zip(("reward", "terminated", "truncated"), own, strict=True))
-            step = to_host(found | {name: info[name] for name in info.keys() & {"split", "is_success"}})
+            own_info = {name: info[name] for name in info.keys() & {"split", "is_success"}}
+            step = to_host(found | own_info | {f"term {name}": value for name, value in info["reward_terms"].items()})
             totals += step["reward"].astype(np.float32)
+            for name in info["reward_terms"]:
+                terms[name] = terms.get(name, 0.0) + step[f"term {name}"]
             pieces.append(largest_piece(env.state.x[:, : env.model.num_robot_particles], env.env_state.origin))
             starts = step["terminated"] | step["truncated"]
             for i in np.flatnonzero(starts).tolist():
@@ -175,7 +192,8 @@ class Trial:
                     torn = limit is not None and bool(step["split"][i] > limit)
                     success = bool(step["is_success"][i]) if "is_success" in step else None
                     share = [piece[i] for piece in pieces]
-                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)))
+                    sums = {name: float(values[i]) for name, values in terms.items()}
+                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)), sums)
             if starts.any() and len(played) < count:
                 with torch.no_grad():  # so that what has ended stays a robot, and not what is left of one
                     observation, _ = env.reset(options={"reset_mask": torch.from_numpy(starts)})
@@ -210,20 +228,25 @@ class EpisodesStopped(Exception):
 
 
 def play(
-    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+    trials: Sequence[Trial],
+    steps: int | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    name: str = "evaluation",
 ) -> list[list[Played]]:
     """Play the episodes of all trials, those of each in the order of their layouts.
 
     Args:
         trials: What to play.
-        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
+        name: What the progress bar is called.
     """
     spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
     workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
     total = (steps or 0) * sum(trial.episodes for trial in trials)
-    bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
+    # Beside the bar of a training (leave=None) it vanishes at the end.
+    bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))
 
     def play_span(trial: Trial, first: int, count: int) -> list[Played]:
         taken = 0
@@ -293,6 +316,11 @@ class Result:
         return t_interval(self.returns)
 
     @property
+    def terms(self) -> dict[str, float]:
+        """What each term of the reward, with its weight, contributes to the mean return."""
+        return {name: _mean(each.terms[name] for each in self.episodes) for name in self.episodes[0].terms}
+
+    @property
     def success(self) -> float | None:
         """Share of successful episodes; None where the task does not define success."""
         return None if self.episodes[0].success is None else _mean(bool(each.success) for each in self.episodes)
@@ -324,7 +352,10 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def evaluate(
-    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+    trials: Sequence[Trial],
+    steps: int | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    name: str = "evaluation",
 ) -> list[Result]:
     """Evaluate policies without learning; torch's generator is left as it was.
 
@@ -332,28 +363,29 @@ def evaluate(
 
     Args:
         trials: Episodes, all played side by side.
-        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        steps: Steps of an episode at most, to show a progress bar; None shows none.
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
+        name: What the progress bar is called.
     """
-    played = zip(trials, play(trials, steps, should_stop), strict=True)
+    played = zip(trials, play(trials, steps, should_stop, name), strict=True)
     return [Result(trial.name, trial.resolution, tuple(episodes)) for trial, episodes in played]
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
+    """Evaluate policies beside zero and random action on the same layouts; a plan also on the one it was made for."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
     trials = [
         make_trial(config, f"{kind} action", UntrainedPolicy(kind, coarsest), episodes, deterministic=True, seed=seed)
         for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
-        default = without_noise(trained, noise)
-        for deterministic in (False, True) if noise == "both" else (default,):
-            label = f"{name}, {'mean' if deterministic else 'noisy'}" if noise == "both" else name
-            trials.append(make_trial(config, label, trained, episodes, deterministic=deterministic, seed=seed))
-        if "layout" in trained.description:
+        default, shown = without_noise(trained, noise), name_in_table(name, trained)
+        if is_plan(trained):
             own = trained.description["layout"]
-            trials.append(make_trial(config, "  own layout", trained, 1, deterministic=default, seed=own))
+            trials.append(make_trial(config, PLAN, trained, 1, deterministic=default, seed=own))
+        for deterministic in (False, True) if noise == "both" else (default,):
+            label = f"{shown}, {'mean' if deterministic else 'noisy'}" if noise == "both" else shown
+            trials.append(make_trial(config, label, trained, episodes, deterministic=deterministic, seed=seed))
     return evaluate(trials, config.make_spec().horizon)
 
 
@@ -385,12 +417,38 @@ def format_table(config: RunConfig, results: Sequence[Result]) -> str:
     """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
     counts = {len(result.returns) for result in results}
     title = f"{config.task}, return over {' or '.join(map(str, sorted(counts)))} episodes"
-    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
+    width = max(16, *(len(result.name) + 2 for result in results))
+    titles = f"{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"
+    lines = [title, f"{'policy':<{width}}{titles}"]
     for result in results:
         grid = f"{result.resolution}x{result.resolution}"
         interval = "–" if result.interval is None else f"{result.interval:.1f}"
         spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
         spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
         success = "" if result.success is None else f"   success {result.success:.0%}"
-        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}   in one piece {result.piece:.0%}")
+        lines.append(f"{result.name:<{width}}{grid:>8}{spread}{success}   in one piece {result.piece:.0%}")
     return "\n".join(lines)
+
+
+def explain(config: RunConfig, results: Sequence[Result], chosen: bool) -> str:
+    """Why the final table of a run and the evaluations during its training have different numbers.
+
+    Args:
+        config: Options of the run.
+        results: The table.
+        chosen: Whether the evaluations chose the policy.
+    """
+    sentences = []
+    if chosen and config.eval_every:
+        varied = any(config.conditions(stage) for stage in range(1, len(config.ends()) + 1))
+        conditions = " Conditions varied in the episodes of training, and do not vary in these." if varied else ""
+        sentences.append(
+            "Evaluations during training give other numbers: they chose the policy, so the best of them is partly "
+            f"luck. This table is of other episodes, from starts that neither trained nor chose the policy.{conditions}"
+        )
+    if any(result.name == PLAN for result in results):
+        sentences.append(
+            "A plan is made for one start, and its own episode was the evaluation during training; the row below it "
+            "shows what the same actions do from other starts."
+        )
+    return " ".join(sentences)

@@ -12,6 +12,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_seed, without_noise
+from cfp.messages import say
 from cfp.policy import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
@@ -71,7 +72,7 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
 def save_media(
     recording: Recording, paths: Mapping[str, Path | None], output: TextIO | None = None, **options: Any
 ) -> None:
-    """Write an episode to files and print their names; without the packages that an MP4 needs, print how to get them.
+    """Write an episode to files and print their names; where MP4 cannot be written, print why.
 
     Args:
         recording: The episode.
@@ -82,6 +83,6 @@ def save_media(
     for name, path in paths.items():
         try:
             if path is not None:
-                print(f"{name}: {recording.save(path, **options)}", file=output)
+                say(f"{name}: {recording.save(path, **options)}", output)
         except VideoUnavailable as error:
-            print(f"no {name}: {error}", file=output)
+            say(f"no {name}: {error}", output)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import time
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoardOutputFormat, filter_excluded_keys
+from stable_baselines3.common.logger import (
+    HParam,
+    Image,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+    filter_excluded_keys,
+)
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
@@ -23,9 +29,12 @@ from cfp.experiment.cli import Stopped, StopSignals
 from cfp.experiment.folder import policy_path
 from cfp.files import write_text
 from cfp.learner import Learner
+from cfp.messages import progress_bar
 from cfp.policy import describe_run
 from cfp.tables import CSVTable
 
+#: Called with each new row of ``evaluations.csv``; may raise an exception to end the training.
+OnEvaluation: TypeAlias = Callable[[dict[str, Any]], object]
 #: Scalars that every algorithm logs beside its own.
 LOG_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",
@@ -49,6 +58,7 @@ EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",
     "eval/std": "standard deviation of these returns",
     "eval/success": "share of successes among them, where the task defines success",
+    "reward/TERM": "what each term of the task's reward, with its weight, contributes to eval/return",
 }
 
 
@@ -73,6 +83,12 @@ class EventFile(TensorBoardOutputFormat):
     def __init__(self, folder: Path, step: int) -> None:
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=step + 1 if step else None)
         self._is_closed = False
+
+    def write_options(self, config: RunConfig) -> None:
+        """Show the options of the run under HParams, beside its evaluations."""
+        plain = {name: v if isinstance(v, bool | int | float) else str(v) for name, v in to_json(config).items()}
+        shown = HParam(plain, dict.fromkeys(("eval/return", "eval/success"), 0.0))  # the last values count, not these
+        self.write({"options": shown}, {"options": ()})
 
 
 def check_wandb(config: RunConfig) -> None:
@@ -121,6 +137,7 @@ class WandbWriter(KVWriter):
 def make_trackers(config: RunConfig, folder: Path, step: int) -> list[KVWriter]:
     """The places to which a run's rows go besides its tables."""
     events = EventFile(folder / "tensorboard", step)
+    events.write_options(config)
     return [events, WandbWriter(config, folder)] if config.wandb != "off" else [events]
 
 
@@ -191,16 +208,11 @@ class ProgressBarCallback(StageCallback):
     def __init__(self, stage: Stage) -> None:
         super().__init__(stage, 0)
         self.values = dict[str, str]()
-        self.bar = tqdm(disable=True)
+        self.bar = progress_bar(disable=True)
 
     def _on_training_start(self) -> None:
-        self.bar = tqdm(
-            total=self.stage.config.ends()[-1],
-            initial=self.stage.step,
-            desc=f"stage {self.stage.number}",
-            unit="step",
-            mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
-        )
+        total, desc = self.stage.config.ends()[-1], f"stage {self.stage.number}"
+        self.bar = progress_bar(total=total, initial=self.stage.step, desc=desc)
 
     def _on_step(self) -> bool:
         self.bar.update(self.stage.step - self.bar.n)
@@ -246,9 +258,16 @@ class EvaluationCallback(StageCallback):
     """
 
     def __init__(
-        self, stage: Stage, table: CSVTable, trackers: Logger, bar: ProgressBarCallback, signals: StopSignals
+        self,
+        stage: Stage,
+        table: CSVTable,
+        trackers: Logger,
+        bar: ProgressBarCallback,
+        signals: StopSignals,
+        on_evaluation: OnEvaluation | None,
     ) -> None:
         super().__init__(stage, stage.config.eval_every)
+        self.on_evaluation = on_evaluation
         self.table, self.trackers, self.bar, self.signals = table, trackers, bar, signals
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
@@ -277,7 +296,7 @@ class EvaluationCallback(StageCallback):
             conditions=config.conditions(stage.number),
         )
         try:
-            result = evaluate([trial], should_stop=lambda: self.signals.number != 0)[0]
+            result = evaluate([trial], config.make_spec().horizon, lambda: self.signals.number != 0)[0]
         except EpisodesStopped:
             if not self.signals.number:
                 raise
@@ -290,14 +309,18 @@ class EvaluationCallback(StageCallback):
         self.evaluated = stage.step
         lowest, highest = min(result.returns), max(result.returns)
         values = stage.step, stage.number, episodes, result.mean, result.std, lowest, highest, result.success
-        self.table.add(dict(zip(EVALUATION_COLUMNS, values, strict=True)))
+        row = dict(zip(EVALUATION_COLUMNS, values, strict=True))
+        self.table.add(row)
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
+        scalars |= {f"reward/{name}": value for name, value in result.terms.items()}
         for name, value in scalars.items():
             self.trackers.record(name, value)
         for name, picture in stage.learner.images().items():
             self.trackers.record(name, Image(picture, "HWC"))
         self.trackers.dump(stage.step)
         self.bar.show(evaluated=result.mean)
+        if self.on_evaluation is not None:
+            self.on_evaluation(row)
 
     def _on_training_start(self) -> None:
         starts_trained = self.stage.learner.starts_trained and self.every and not self.means

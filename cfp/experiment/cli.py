@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import inspect
+import io
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -31,6 +33,24 @@ def keep_memory() -> None:
         # other setting, which would fix it at its small initial value.
         if any(library.mallopt(_M_MMAP_THRESHOLD, size) for size in (1 << 30, 1 << 25)):
             library.mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
+
+
+@contextmanager
+def printable() -> Iterator[None]:
+    """Meanwhile the standard output shows what its encoding lacks as escapes, as Python's standard error always does.
+
+    A program must not end because of a letter after hours of work.
+    """
+    output = sys.stdout
+    if not isinstance(output, io.TextIOWrapper):
+        yield
+        return
+    errors = output.errors
+    output.reconfigure(errors="backslashreplace")
+    try:
+        yield
+    finally:
+        output.reconfigure(errors=errors)
 
 
 class Stopped(Exception):
@@ -69,6 +89,7 @@ class StopSignals:
         )
 
 
+@printable()
 def run_command(command: Callable[[], int | None]) -> int:
     """Run a program; turn an expected error into one line on the standard error, and any outcome into an exit code.
 
@@ -79,7 +100,7 @@ def run_command(command: Callable[[], int | None]) -> int:
     keep_memory()
     try:
         code = command() or 0
-        sys.stdout.flush()  # while a reader that has gone is still noticed here
+        print(end="", flush=True)  # while a reader that has gone is still noticed here; there may be no output
         return code
     except Stopped as stopped:
         print(stopped)

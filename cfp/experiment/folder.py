@@ -115,6 +115,11 @@ def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
     except Timeout:
         owner = path.read_text().strip() if path.exists() else ""
         raise FolderInUse(f"out: {folder} is in use by {owner or 'another process'}") from None
+    except OSError as error:
+        if error.filename is not None:  # it cannot be opened
+            raise
+        remedy = "some network file systems have no locks: name a folder on another one, such as a local disk"
+        raise ConfigError(f"out: {folder} cannot be locked ({error.strerror}); {remedy}") from error
     try:
         with lock:
             path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")

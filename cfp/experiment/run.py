@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import textwrap
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
@@ -14,13 +16,14 @@ from stable_baselines3.common.logger import Logger
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.page import plot_curve, write_page
-from cfp.evaluation.returns import compare, format_table, to_rows
+from cfp.evaluation.page import draw_curve, write_figure, write_page
+from cfp.evaluation.returns import compare, explain, format_table, name_in_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
     CheckpointCallback,
     EvaluationCallback,
     LogCallback,
+    OnEvaluation,
     ProgressBarCallback,
     ProgressTable,
     Stage,
@@ -33,6 +36,7 @@ from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import holds_progress, holds_run, policy_files, policy_path
 from cfp.files import read_json, write_atomically, write_json
 from cfp.learner import Learner
+from cfp.messages import say
 from cfp.policy import copy_policy, read_policy
 from cfp.tables import CSVTable
 from dittogym.render.frame import png
@@ -59,9 +63,16 @@ class TrainingRun:
     """
 
     def __init__(
-        self, learner: type[Learner], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
+        self,
+        learner: type[Learner],
+        config: RunConfig,
+        folder: Path,
+        resume: bool,
+        signals: StopSignals,
+        on_evaluation: OnEvaluation | None = None,
     ) -> None:
         check_options(config)
+        self.on_evaluation = on_evaluation
         if holds_progress(folder) and not resume:
             raise ConfigError(
                 f"out: {folder} already holds a run; continue it with --resume (resume=True), or name another folder"
@@ -78,7 +89,7 @@ class TrainingRun:
             if (folder / "results.json").exists():
                 raise CheckpointError(f"{folder}: the run is finished, but its checkpoint is missing")
             if holds_run(folder):
-                print(f"{folder} holds no checkpoint: starting from the beginning")
+                say(f"{folder} holds no checkpoint: starting from the beginning")
             self.stage, self.offset = learner.begin(config, folder)
             self.step = self.offset
         write_json(folder / "config.json", to_json(config))
@@ -97,7 +108,7 @@ class TrainingRun:
             pixels = np.where(used, 0, 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
             picture = png(np.dstack([pixels] * 3))
             write_atomically(path, lambda file: file.write(picture))
-            print(f"target: {path}")
+            say(f"target: {path}")
 
     def _stored_options(self) -> dict[str, Any]:
         """The options of the run that the folder holds."""
@@ -118,12 +129,12 @@ class TrainingRun:
         self.step = self.offset + self.state["num_timesteps"]
         if total < min(self.step, past.get("steps", 0)):
             raise ConfigError(f"steps must be at least {self.step}, those that the run has taken, got {total}")
-        print(f"resuming {folder} at step {self.step} of {total} (stage {self.stage})")
+        say(f"resuming {folder} at step {self.step} of {total} (stage {self.stage})")
 
     def train(self) -> None:
         """Train the stages that are left."""
         for line in self.learner.warnings(self.config, self.folder, self.stage):
-            print(line)
+            say(line)
         try:
             self.learner.prepare(self.config, self.folder, self.signals)
             for number in range(self.stage, self.stages + 1):
@@ -159,7 +170,7 @@ class TrainingRun:
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
         bar = ProgressBarCallback(stage)
-        evaluation = EvaluationCallback(stage, self.evaluations, self.trackers, bar, self.signals)
+        evaluation = EvaluationCallback(stage, self.evaluations, self.trackers, bar, self.signals, self.on_evaluation)
         # A process killed after the last step but before the last evaluation still has to evaluate.
         if not stage.steps_left and not evaluation.is_missing:
             return
@@ -184,13 +195,19 @@ class TrainingRun:
         policies = {name: self.learner.load_policy(path, device) for name, path in files.items()}
         results = compare(self.config, policies, self.config.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
-        print(format_table(self.config, results))
-        best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
-        if best != list(files)[-1]:
-            print(f"{best} has the highest mean return; its policy is {files[best]}")
+        say(format_table(self.config, results))
+        note = explain(self.config, results, self.learner.keeps_best)
+        if note:
+            say("\n".join(textwrap.wrap(note, 100)))
+        shown = {name_in_table(name, policies[name]): path for name, path in files.items()}
+        best = max((result for result in results if result.name in shown), key=lambda result: result.mean).name
+        if best != list(shown)[-1]:
+            say(f"{best} has the highest mean return; its policy is {shown[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
-        print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
+        with matplotlib.style.context("default"):  # not the user's own, which may need LaTeX
+            write_figure(self.folder / "curve.png", draw_curve(self.folder, self.config, untrained))
+        say(f"learning curve: {self.folder / 'curve.png'}")
         if self.config.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
+        say(f"all of it on one page: {write_page(self.folder, self.config, results, note)}")

@@ -92,8 +92,8 @@ class RewardStatistics(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(()))
-        self.register_buffer("variance", torch.ones(()))
+        self.register_buffer("mean", torch.zeros((), dtype=torch.float32))
+        self.register_buffer("variance", torch.ones((), dtype=torch.float32))
 
     @torch.no_grad()
     def forward(self, rewards: Tensor, part: Tensor | float = 1.0) -> Tensor:

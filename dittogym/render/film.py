@@ -15,12 +15,14 @@ from PIL import Image
 from dittogym.files import replacing
 
 Frame = TypeVar("Frame")
+#: What an error says when the ffmpeg that imageio has found is of no use; ffmpeg itself prints why.
+FAILED = "MP4 cannot be written: ffmpeg, which needs libx264, has failed"
 #: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.
 UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
 
 
 class VideoUnavailable(ImportError):
-    """The optional packages that write MP4 files are not installed."""
+    """The optional packages that write MP4 files are not installed, or their ffmpeg fails."""
 
 
 def available() -> bool:
@@ -49,7 +51,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         rate: Pictures per second, see :func:`possible_rate`.
 
     Raises:
-        VideoUnavailable: MP4 without imageio and its ffmpeg.
+        VideoUnavailable: MP4 without imageio and an ffmpeg with libx264.
     """
     with replacing(path) as aside:
         if path.suffix == ".mp4":
@@ -76,4 +78,10 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     writer: Any = imageio.get_writer(path, format="FFMPEG", fps=rate, **options)
     with closing(writer):  # its own `with` leaves ffmpeg running where there is an error
         for frame in _held(frames, round(rate)):
-            writer.append_data(frame)
+            try:
+                writer.append_data(frame)
+            except (OSError, RuntimeError) as error:
+                reason = str(error).partition("\n")[0]  # a page follows
+                raise VideoUnavailable(f"{FAILED} ({reason})") from error
+    if not path.stat().st_size:  # ffmpeg took all of a short film before it failed
+        raise VideoUnavailable(FAILED)

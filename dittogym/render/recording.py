@@ -137,7 +137,7 @@ class Recording:
         Raises:
             ValueError: The suffix is another, or a number is out of range.
             TypeError: There is no such option.
-            dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``.
+            dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``, or with an ffmpeg that fails.
         """
         path, chosen = check_path(path), FilmOptions(**options)
         if path.suffix == ".html":

@@ -379,7 +379,7 @@ def test_curves_are_aligned_where_all_have_values():
     assert align([one, apart])[1].shape == (2, 0)
 
 
-def written(folder, label, seed, returns, observes="image", curve=None):
+def written(folder, label, seed, returns, observes="image", curve=None, plan=None):
     """A run as it lies in its folder."""
     run = Run(label, "run", seed, {"algo": label, "device": "cpu"}, folder / f"{label}-{seed}")
     layouts, successes = list(range(20000, 20000 + len(returns))), [value > 5 for value in returns]
@@ -391,7 +391,7 @@ def written(folder, label, seed, returns, observes="image", curve=None):
         "observes": observes,
         "layouts": layouts,
     }
-    evaluation |= {"returns": returns, "successes": successes, "own_layout": None}
+    evaluation |= {"returns": returns, "successes": successes, "own_layout": plan}
     record = {"options": run.options, "evaluation": evaluation}
     write_json(run.folder / "comparison.json", record | ({"seconds": 120.0} if curve else {}))
     if curve:
@@ -425,6 +425,35 @@ def test_table_against_values_worked_out_by_hand(tmp_path):
         text = (tmp_path / name).read_text()
         assert "coarse-1: failed (NonFiniteError" in text and "+4.0" in text and "4 of 5 runs" in text
     assert len(rows(tmp_path)) == 8
+
+
+def test_a_plan_has_a_row_for_its_own_start_and_one_for_others(tmp_path):
+    runs = [written(tmp_path, "mpc", seed, [4.0, 6.0], "simulator", {500: 1}, plan=10.0 + seed) for seed in (0, 1)]
+    results = [read_result(run, Protocol(2)) for run in [*runs, written(tmp_path, "zero", 0, [1.0, 3.0], "nothing")]]
+    plan, replayed, zero = make_table(results, "zero", Protocol(2)).rows
+    assert [row["algorithm"] for row in (plan, replayed)] == ["mpc: plan", "mpc: plan, replayed from another start"]
+    assert (plan["mean"], plan["episodes"], "difference" in plan) == (10.5, 2, False)
+    assert (replayed["mean"], replayed["episodes"], replayed["difference"]) == (5.0, 4, 3.0)
+    assert zero["algorithm"] == "zero"
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_of_the_report_is_cut_off(tmp_path, browser, width):
+    runs = [
+        written(tmp_path, label, seed, [70_123.4, -60_123.4], what, {25_600: 1}, plan=plan)
+        for label, what, plan in (
+            ("cfp-analytic", "image", None),
+            ("transformer-64", "state", None),
+            ("gradient", "simulator", 1e5),
+            ("zero", "nothing", None),
+        )
+        for seed in ((0,) if label == "zero" else (0, 1))
+    ]
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    page.goto(write_report(tmp_path, [read_result(run, Protocol(2)) for run in runs], "zero", Protocol(2)).as_uri())
+    boxes = "[...document.querySelectorAll('html, .wide, img')].map(box => [box.scrollWidth, box.clientWidth])"
+    whole, table, picture = page.evaluate(boxes)
+    assert whole == [width, width] and table[0] == table[1] > 0.9 * width and picture[1] > 0.9 * width
 
 
 def test_evaluations_under_another_protocol_do_not_count(tmp_path):

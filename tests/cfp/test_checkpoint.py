@@ -1,5 +1,6 @@
 """The replay ring, its chunks on disk, checkpoints of both learners, and the lock of a folder."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 
 from cfp import CFPPolicy, Hyperparameters
 from cfp.envs.vec_env import monitored
-from cfp.errors import CheckpointError
+from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.checkpoint import Checkpoint, ReplayArchive
 from cfp.experiment.folder import FolderInUse, run_lock
 from cfp.files import write_atomically
@@ -266,6 +267,16 @@ def test_folder_is_held_by_one_process_until_it_ends(tmp_path):
         process.kill()
         process.communicate()
     assert folder.exists() and not list(folder.iterdir())
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    def flock(descriptor, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(ConfigError, match=f"^out: {tmp_path}/run .*{os.strerror(errno.ENOLCK)}.*local disk"):
+        with run_lock(tmp_path / "run"):
+            pass
 
 
 def test_new_folder_goes_again_if_nothing_was_written_and_a_linked_lock_is_left_alone(tmp_path):

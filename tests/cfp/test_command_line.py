@@ -1,6 +1,7 @@
 """Command lines: options, help, ``--dry-run``, exit codes and error lines, warnings before a training."""
 
 import dataclasses
+import io
 import json
 import os
 import re
@@ -143,3 +144,17 @@ def test_output_that_nobody_reads_any_more_is_no_error(monkeypatch):
     with open(writer, "w") as output:  # buffered, as that of a program in a pipe
         monkeypatch.setattr(sys, "stdout", output)
         assert run_command(lambda: print("a few words")) == 141
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_letters_that_the_output_lacks_are_escaped(encoding, monkeypatch):
+    output = io.TextIOWrapper(io.BytesIO(), encoding)
+    monkeypatch.setattr(sys, "stdout", output)
+    assert run_command(lambda: print("→ \udce4")) == 0  # the latter stands for a byte of a file name
+    assert output.buffer.getvalue() == b"\\u2192 \\udce4\n"
+
+
+def test_a_program_needs_no_output(monkeypatch):
+    """As after ``>&-`` in a shell."""
+    monkeypatch.setattr(sys, "stdout", None)
+    assert run_command(lambda: print("a few words")) == 0

@@ -8,6 +8,7 @@ import pytest
 import torch
 from fakes import FakeEnv
 
+from cfp import messages
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
@@ -127,6 +128,14 @@ def test_returns_are_in_the_order_of_layouts(batch):
     assert result.mean_piece == pytest.approx((3 * 0.9 + 3 * 0.8) / 6)
     if batch == 1:
         assert policy.steps == 3 * 4 + 3
+
+
+@pytest.mark.parametrize("seconds", [0.0, 100.0])
+def test_progress_of_a_long_evaluation_is_shown_where_there_is_no_terminal(seconds, monkeypatch, capsys):
+    monkeypatch.setattr(messages, "SELDOM", seconds)
+    evaluate([fake_trial(Counting(), 2)], steps=4)
+    shown = capsys.readouterr().err
+    assert "evaluation: 100%" in shown and "8/8" in shown if not seconds else shown == ""
 
 
 def test_an_episode_that_fails_ends_the_others():

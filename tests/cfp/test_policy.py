@@ -49,6 +49,40 @@ def test_loaded_policy_acts_bit_for_bit_as_the_one_in_training(saved, name):
             assert actions[0].shape == (*observation.shape[:-3], 2, 64, 64)
 
 
+@pytest.fixture
+def double_precision():
+    """As torch's default."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("name", ["run", "kick"])
+def test_double_precision_as_default_changes_no_action(name, double_precision):
+    found = cfp.load(name).predict(images(), deterministic=True)[0]
+    torch.set_default_dtype(torch.float32)
+    np.testing.assert_array_equal(found, cfp.load(name).predict(images(), deterministic=True)[0])
+
+
+def test_actions_have_single_precision_under_autocast(saved):
+    """Of a loaded policy and of the one in training, and the gate."""
+    policy = cfp.load(saved[0])
+    trained = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
+    trained.actor.load_state_dict(saved[1].state_dict())
+    whole, gate = policy.predict_with_gate(images(), deterministic=True)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, found_gate = policy.predict_with_gate(images(), deterministic=True)
+        other, _ = trained.predict(images(), deterministic=True)
+    for one, precise in ((found, whole), (found_gate, gate), (other, whole)):
+        assert one.dtype == np.float32
+        np.testing.assert_allclose(one, precise, atol=0.02)
+
+
+def test_a_device_may_be_a_device_of_torch(saved):
+    policy = cfp.load(saved[0], device=torch.device("cpu"))
+    assert {parameter.device.type for parameter in policy.parameters()} == {"cpu"}
+
+
 @pytest.mark.parametrize(
     ("image", "given"),
     [
@@ -146,6 +180,13 @@ def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
     actions, _ = cfp.load(name).predict(images(), deterministic=True)
     np.testing.assert_allclose(actions[0, 0, 0, :2], first, atol=1e-5)
     assert actions.sum(dtype=np.float64) == pytest.approx(total, abs=1e-3, rel=1e-6)
+
+
+def test_representation_says_what_a_policy_is_for():
+    policy = cfp.load("run")
+    steps, seed = policy.description["steps"], policy.description["seed"]
+    assert repr(policy) == f"ActorPolicy(task='run', resolution={policy.resolution}, steps={steps}, seed={seed})"
+    assert repr(cfp.ActorPolicy(policy.spec)) == f"ActorPolicy(resolution={policy.resolution})"
 
 
 def test_a_folder_without_a_policy_hides_no_shipped_one(tmp_path, monkeypatch):

@@ -1,11 +1,15 @@
 """Training from Python is training from the command line."""
 
+import io
 import signal
+import sys
 from pathlib import Path
 
+import cv2
+import matplotlib
 import pytest
 from short_episodes import HORIZON
-from tiny_runs import TINY, at_step
+from tiny_runs import TINY, assert_same_run, at_step
 
 import cfp
 from cfp import train
@@ -34,6 +38,53 @@ def test_fit_is_the_command_line_and_resumes_after_ctrl_c(tmp_path):
     assert run.folder == folder and run.policy.description["steps"] == 30
 
 
+class Pruned(Exception):
+    """As a library that searches for options raises it to end a training that does not look promising."""
+
+
+def test_a_training_is_quiet_if_asked_to_and_can_be_ended_by_its_evaluations(finished, tmp_path, capfd):
+    rows = []
+
+    def prune(row):
+        rows.append(row)
+        if row["step"] == 120:
+            raise Pruned
+
+    folder = tmp_path / "run"
+    with pytest.raises(Pruned):
+        cfp.fit("shapematch", steps=150, out=folder, quiet=True, on_evaluation=prune, **OPTIONS)
+    assert [(row["step"], row["stage"]) for row in rows] == [(60, 1), (70, 1), (70, 2), (120, 2)]
+    assert not (folder / "results.json").exists()
+    run = cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=rows.append, **OPTIONS)
+    assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
+    assert_same_run(folder, finished)
+    assert capfd.readouterr() == ("", "")
+
+
+class Bare:
+    """A standard error that can do no more than Python asks for."""
+
+    write = flush = staticmethod(lambda *text: None)
+
+
+@pytest.mark.parametrize("error", [Bare(), None])
+def test_a_run_ends_with_its_page_whatever_is_around_it(error, tmp_path, monkeypatch):
+    """Output in ASCII, figures of LaTeX, an ffmpeg that does not start, and little or no standard error."""
+    output = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(sys, "stderr", error)
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
+    monkeypatch.setitem(matplotlib.rcParams, "figure.facecolor", "red")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    short = {"eval_every": 10, "eval_episodes": 2, "resolutions": [4], "handover": [], "video": True}
+    cfp.fit("shapematch", steps=20, out=tmp_path / "run", **OPTIONS | short)
+    assert (tmp_path / "run" / "index.html").exists() and (tmp_path / "run" / "replay.html").exists()
+    assert cv2.imread(str(tmp_path / "run" / "curve.png"))[0, 0].tolist() == [255, 255, 255]
+    output.flush()
+    text = output.buffer.getvalue().decode("ascii")
+    assert "\\xb1" in text and "no video: " in text and output.errors == "strict"
+
+
 def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
     run = cfp.Run(finished)
     assert run.policy.resolution == 64 and run.policy.description == read_policy(finished)[1]
@@ -41,6 +92,9 @@ def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
     best = max((row for row in run.evaluations if row["stage"] == 2), key=lambda row: row["mean"])
     assert run.policy.description["steps"] == best["step"]
     assert [row["policy"] for row in run.results] == ["zero action", "random action", "stage 1", "stage 2"]
+    returned = f"{run.results[-1]['mean']:.1f}"
+    assert repr(run) == f"Run({str(finished)!r}, task='shapematch', resolution=8, mean_return={returned})"
+    assert run._repr_png_().startswith(b"\x89PNG")
     recording = run.film(tmp_path / "film.html", speed=0.5)
     assert len(recording.rewards) == HORIZON and (tmp_path / "film.html").stat().st_size > 10_000
     with pytest.raises(ValueError, match="path must end in"):
@@ -54,6 +108,8 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
     run = cfp.Run(tmp_path)
     assert run.policy.resolution == 64 and run.evaluations == []
+    assert repr(run) == f"Run({str(tmp_path)!r}, task='shapematch', resolution=8)"
+    assert run._repr_png_().startswith(b"\x89PNG")  # no evaluation yet
     with pytest.raises(cfp.CheckpointError, match="not finished"):
         _ = run.results
     (tmp_path / "results.json").write_text('[{"policy": ')

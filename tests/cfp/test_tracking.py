@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tiny_runs import assert_same_run, resume, run
 
 from cfp.agent.actor import ActorSpec, build_actor
@@ -63,7 +64,8 @@ def test_everything_written_is_explained_and_everything_explained_is_written(lea
     columns = set(read_table(folder / "progress.csv")[0])
     assert columns - {"step"} == rows - {"time/steps_per_second"}
     read = events(folder)
-    assert set(read.Tags()["scalars"]) == rows | set(EVALUATION_METRICS)
+    scalars = {"reward/TERM" if name.startswith("reward/") else name for name in read.Tags()["scalars"]}
+    assert scalars == rows | set(EVALUATION_METRICS)
     assert set(read.Tags()["images"]) == set(PICTURES)
     assert set(read_table(folder / "evaluations.csv")[0]) == set(EVALUATION_COLUMNS)
 
@@ -76,6 +78,20 @@ def test_evaluations_and_pictures_stand_at_their_steps(finished):
     assert [event.step for event in read.Images("picture/action")] == [60, 70, 70, 120, 150]
     gates = read.Images("picture/gate")  # the first stage has none
     assert [(event.step, event.height) for event in gates] == [(70, 192), (120, 192), (150, 192)]
+
+
+def test_terms_of_the_reward_add_up_to_the_return(finished):
+    read = events(finished)
+    terms = [name for name in read.Tags()["scalars"] if name.startswith("reward/")]
+    assert "reward/failure" in terms and len(terms) > 2
+    sums = np.sum([[event.value for event in read.Scalars(name)] for name in terms], axis=0)
+    np.testing.assert_allclose(sums, [event.value for event in read.Scalars("eval/return")], rtol=1e-5)
+
+
+def test_options_are_shown_as_hyperparameters(finished):
+    content = events(finished).PluginTagToContent("hparams")["_hparams_/session_start_info"]
+    options = HParamsPluginData.FromString(content).session_start_info.hparams
+    assert options["batch_size"].number_value == 4 and options["resolutions"].string_value == "(4, 8)"
 
 
 def test_pictures_show_the_mean_action_and_draw_no_random_number():

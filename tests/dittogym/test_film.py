@@ -1,9 +1,11 @@
 """Films, filmstrips and replays of an episode."""
 
 import base64
+import io
 import json
 import re
 import zlib
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
@@ -103,6 +105,38 @@ def test_a_film_that_fails_leaves_the_old_file(tmp_path, suffix: str) -> None:
     assert [each.name for each in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
+def test_two_may_write_the_same_film(tmp_path, suffix: str) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / f"film{suffix}"
+
+    def pictures(grey: int, meanwhile: bool) -> Iterator[np.ndarray]:
+        yield np.full((64, 64, 3), grey, np.uint8)
+        if meanwhile:
+            write_film(path, pictures(50, meanwhile=False), 10.0)
+        yield np.full((64, 64, 3), grey, np.uint8)
+
+    write_film(path, pictures(200, meanwhile=True), 10.0)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    picture = cv2.VideoCapture(str(path)).read()[1] if suffix == ".mp4" else np.asarray(Image.open(path))
+    assert picture.mean() == pytest.approx(200, abs=3)
+
+
+@pytest.mark.parametrize("says", ["exit 1", "cat > /dev/null; exit 1"])
+def test_an_ffmpeg_that_fails_is_named(tmp_path, monkeypatch: pytest.MonkeyPatch, says: str) -> None:
+    """Also one that only fails once it has taken the whole film, as a short one fits into a pipe."""
+    pytest.importorskip("imageio_ffmpeg")
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{says}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    pictures = [np.zeros((512, 512, 3), np.uint8)] * 10
+    with pytest.raises(VideoUnavailable, match="ffmpeg"):
+        write_film(tmp_path / "film.mp4", pictures, 10.0)
+    assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]
+
+
 @pytest.mark.parametrize("suffix", [".html", ".png", ".webp"])
 def test_a_program_that_is_stopped_leaves_the_old_file(
     recording: Recording, tmp_path, monkeypatch, suffix: str
@@ -142,6 +176,17 @@ def test_environments_of_gymnasium_film_too(tmp_path) -> None:
     recorded = env.film(wave, tmp_path / "film.html", seed=1)
     assert (tmp_path / "film.html").stat().st_size > 1000 and len(recorded.rewards) == 30
     assert "<iframe" in recorded._repr_html_() and env._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_notebook_shows_all_robots_of_a_batch() -> None:
+    batch = gymnasium.make_vec("dittogym/run-coarse-v0", num_envs=3, **SMALL)
+    assert batch._repr_png_() is None
+    batch.reset(seed=0)
+    sheet = np.asarray(Image.open(io.BytesIO(batch._repr_png_())))
+    assert sheet.shape == (1028, 1028, 3)  # two rows of two, with a line of two pixels after each
+    for index, (row, column) in enumerate(((0, 0), (0, 514), (514, 0))):
+        assert np.array_equal(sheet[row : row + 512, column : column + 512], batch.torch_env.render(index))
+    assert (sheet[514:, 514:] == 255).all()
 
 
 def test_a_film_is_repeatable_and_leaves_torch_s_generator_alone() -> None:

@@ -169,6 +169,17 @@ def test_physics_travels_with_a_moment() -> None:
     assert env.env_state.physics["mass"].tolist() == [1.0, 2.0]
 
 
+def test_representations_are_short() -> None:
+    env = tiny("run", 2)
+    env.reset(seed=0)
+    env.step(torch.zeros(2, *env.action_shape))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    state = repr(env.env_state)
+    assert state.startswith(f"EnvState({env.state!r}") and state.endswith("steps=0 to 1)")
+    assert repr(env.save()) == f"Snapshot('run', {state})"
+    assert repr(env.spec).startswith("TaskSpec('run', horizon=800, coarse=8, fine=16, ")
+
+
 def test_a_snapshot_fits_functions_with_the_same_arguments() -> None:
     def scaled(factor: float) -> TorchEnv:
         spec = make_spec("run")

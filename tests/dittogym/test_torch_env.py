@@ -11,9 +11,10 @@ from tiny import actions, assert_same_bits, everything, forget, tiny
 from torch.utils.checkpoint import checkpoint
 
 import dittogym
-from dittogym import TorchEnv
+from dittogym import TASKS, TorchEnv
 from dittogym.core import FAILURE_REWARD
 from dittogym.observation import per_particle
+from torchmpm import tree
 
 
 def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
@@ -103,6 +104,22 @@ def test_defaults_of_torch_change_nothing() -> None:
                 env.step(torch.full((1, *env.action_shape), 0.3, device="cpu", dtype=torch.float32), soft=True)[1]
             )
     assert all(torch.equal(reward, rewards[0]) for reward in rewards)
+
+
+@pytest.mark.parametrize("backend", ["auto", "eager"])
+@pytest.mark.parametrize("task", TASKS)
+def test_double_precision_as_default_changes_nothing(task: str, backend: str) -> None:
+    """Neither the first particle, nor a pixel, nor the type of an entry of ``info``."""
+    results = []
+    for context in (nullcontext(), float64()):
+        forget(per_particle)
+        with context:
+            env = TorchEnv(task, particles="lite", substeps=2, backend=backend)
+            env.reset(seed=0)
+            action = torch.full((1, *env.action_shape), 0.3, dtype=torch.float32)
+            results.append((env.step(action), env.env_state, env.soft_observation()))
+    for one, other in zip(*map(tree.leaves, results), strict=True):
+        assert one.dtype == other.dtype and torch.equal(one, other)
 
 
 @contextmanager

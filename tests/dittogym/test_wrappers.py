@@ -92,6 +92,25 @@ def test_record_episode_statistics_of_a_batch(mode: str) -> None:
     assert info["episode"]["r"] == pytest.approx(np.sum(rewards, axis=0), abs=1e-4)
 
 
+def test_truth_values_are_those_of_python() -> None:
+    """Gymnasium's vector environments would keep NumPy's as objects; its conversions to other arrays refuse them."""
+    env = gymnasium.make("dittogym/catch-coarse-v0", **SMALL)
+    for info in (env.reset(seed=0)[1], env.step(env.action_space.sample())[4]):
+        assert {name for name, value in info.items() if isinstance(value, bool)} == {"finite", "is_success"} & {*info}
+        assert not any(isinstance(value, np.bool_) for value in info.values())
+    several = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("dittogym/catch-coarse-v0", **SMALL)] * 2)
+    several.reset(seed=0)
+    info = several.step(several.action_space.sample())[4]
+    assert info["finite"].dtype == info["is_success"].dtype == bool
+
+
+def test_conversion_to_torch() -> None:
+    pytest.importorskip("array_api_compat")
+    env = wrappers.NumpyToTorch(gymnasium.make("dittogym/catch-coarse-v0", **SMALL))
+    info = env.reset(seed=0)[1]
+    assert info["finite"].dtype == torch.bool
+
+
 def test_gymnasiums_own_vector_environments() -> None:
     env = gymnasium.make_vec(NAME, num_envs=2, vectorization_mode="sync", **SMALL)
     ours = batch()

@@ -1,6 +1,8 @@
 """The native kernels against the plain substep, in every material and batch."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,6 +15,7 @@ from scenes import assert_close, assert_identical, lively, normal, robot
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.grid import PAD
+from torchmpm.native import kernels
 from torchmpm.native.kernels import MAX_PARTICLES, MAX_RESOLUTION
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
@@ -193,3 +196,36 @@ def test_a_particle_at_the_right_end_of_the_window_is_where_the_grid_says() -> N
         state = ParticleState.at_rest(torch.tensor([[[x, 0.25]]], dtype=torch.float64))
         native, eager = both(solver, state, substeps=2)
         assert bool(native.v.any()) == bool(eager.v.any()) == (x < solver.grid.extent)
+
+
+def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without gradients that changes nothing either."""
+    state, field, origin = moving(COUNT, 3)
+    solver = replace(solvers(COUNT, 3)["three bodies"], backend="native")
+    whole = solver.step(state, field, substeps=250, origin=origin)
+    monkeypatch.setattr(kernels, "KEPT_BYTES", 0)
+    assert_identical(solver.step(state, field, substeps=250, origin=origin), whole)
+    monkeypatch.setattr(kernels, "MIN_SUBSTEPS", 7)
+    assert_identical(solver.step(state, field, substeps=250, origin=origin), whole)
+
+
+ENDLESS = """
+import signal, torch, torchmpm
+drop = torchmpm.Body(500, torchmpm.Elastic(*torchmpm.lame(4e4, 0.3)), mass=0.016, volume=1.6e-5)
+solver = torchmpm.Solver(torchmpm.Grid(128), (drop,), backend="native")
+state = torchmpm.ParticleState.at_rest(0.4 + 0.2 * torch.rand(4, 500, 2))
+solver.step(state)
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for enabled in (True, False):
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    try:
+        with torch.set_grad_enabled(enabled):
+            solver.step(state, substeps=10**12)
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+def test_a_long_step_can_be_stopped() -> None:
+    done = subprocess.run([sys.executable, "-c", ENDLESS], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == 2 * "stopped\n"

@@ -5,7 +5,8 @@ import os
 import runpy
 import stat
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -71,6 +72,54 @@ def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.Monk
     assert list((tmp_path / "cache").rglob("*.so")) == []
 
 
+def test_a_compiler_may_write_any_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As in a language whose letters are not in UTF-8."""
+    says = r"printf 'Warnung \374\n' >&2"
+    monkeypatch.setenv("CXX", script(tmp_path, f'{says}; cp "{torch._C.__file__}" "$last"'))
+    assert isinstance(library.load(torch.float32), ctypes.CDLL)
+    monkeypatch.setenv("CXX", script(tmp_path, f"{says}; exit 3"))
+    with pytest.raises(ValueError, match="Warnung"):
+        library.load(torch.float64)
+
+
+def no_interpreter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    script = tmp_path / "c++"
+    script.write_text("#!/no/such/interpreter\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("CXX", str(script))
+
+
+def no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    no_interpreter(monkeypatch, tmp_path)
+    (tmp_path / "c++").write_bytes(b"\0 not a program")
+
+
+def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+
+
+@pytest.mark.parametrize("prevent", [no_interpreter, no_program, no_folder])
+def test_what_cannot_be_built_runs_eagerly(
+    prevent: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A compiler that cannot be started, or file systems that cannot be written."""
+    prevent(monkeypatch, tmp_path)
+    monkeypatch.setattr(library, "family", lambda: None)
+    assert_identical(*(robot(5, backend=name).step(lively(5)) for name in ("auto", "eager")))
+    with pytest.raises(ValueError, match="backend 'native' could not be built"):
+        library.load(torch.float32)
+
+
+def test_an_interrupted_build_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Unlike one that fails."""
+    monkeypatch.setenv("CXX", script(tmp_path, 'kill -INT "$PPID"; sleep 0.1; exit 3'))
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            library.load(torch.float32)
+    assert runs(tmp_path) == 2
+
+
 def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
     first = library.load(torch.float32)
     assert library.load(torch.float32) is first
@@ -83,12 +132,23 @@ def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
     assert len(files) == 2 and all(file.suffix == ".so" for file in files)
 
 
-def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "text": lambda content: b"half a library",
+    "half": lambda content: content[: len(content) // 2],
+    "zeroed tail": lambda content: content[:-9000].ljust(len(content), b"\0"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
+def test_damaged_file_is_replaced(
+    damage: Callable[[bytes], bytes], quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It would kill the process that loads it."""
     library.load(torch.float32)
     (file,) = (tmp_path / "cache" / "torchmpm").iterdir()
     damaged = tmp_path / "other" / "torchmpm" / file.name
     damaged.parent.mkdir(parents=True)
-    damaged.write_bytes(b"half a library")
+    damaged.write_bytes(damage(file.read_bytes()))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     forget()
     library.load(torch.float32)

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,6 +30,8 @@ MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: backward pass. It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps
 #: are cut. Simulations that run at the same time share it.
 KEPT_BYTES = 2**28
+#: A call on the CPU without gradients is not cut into smaller pieces: as many substeps as a control step has.
+MIN_SUBSTEPS = 100
 #: Share of a GPU's memory that the tape of one simulation may take; as many at once as fit have one.
 CUDA_TAPE_SHARE = 1 / 16
 
@@ -107,6 +110,11 @@ class Kernels:
         limit = substeps
         if torch.is_grad_enabled():  # a piece keeps its start, and needs a tape of all its substeps later
             inputs, limit = tree.without_inference(inputs), self.tape_limit(inputs.components, segment)
+        taped = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+        if not taped and not inputs.components.is_cuda:
+            # Python hears of Ctrl-C between calls, which take some tenths of a second.
+            rounds = math.ceil(state.batch_size / torch.get_num_threads())
+            limit = max(MIN_SUBSTEPS, self.tape_limit(inputs.components[:, :1]) // rounds)
         for start in range(0, substeps, limit):
             components = Step.apply(self.tables, min(limit, substeps - start), *inputs[:6])
             inputs = inputs._replace(components=components)

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -157,31 +158,52 @@ def _compiled(source: Path, options: tuple[str, ...], folder: str, *_: str | Non
     if program is None:
         return NO_COMPILER
     command = [*program, *arguments(source, options, "native"), "-o"]
-    path = Path(folder) / f"{source.stem}-{_key(program, options, source)}.so"
+    name = f"{source.stem}-{_key(program, options, source)}"
+    with suppress(OSError):  # it does not load, for instance where the system's C library is too old
+        if (ready := find_kept(name, ".so")) is not None:
+            return ctypes.CDLL(str(ready))
     try:
-        return ctypes.CDLL(str(path))
-    except OSError:
-        pass  # not there yet, or damaged
+        with tempfile.TemporaryDirectory() as scratch:
+            fresh = Path(scratch) / "fresh.so"
+            _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, program[0])
+            done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, errors="replace", check=False)
+            if done.returncode != 0:
+                failure = f"{shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
+                return f"could not be built: {failure}"
+            return ctypes.CDLL(str(keep(name, ".so", fresh.read_bytes()) or fresh))
+    except OSError as error:  # such as no folder that can be written, or a compiler that cannot be started
+        return f"could not be built with {program[0]}: {error}"
+
+
+def find_kept(name: str, suffix: str) -> Path | None:
+    """What :func:`keep` has written for this name, if it is still whole; a library that is not would kill the process.
+
+    Like :func:`keep` it looks in :func:`cache_folder`.
+    """
+    for path in Path(cache_folder()).glob(f"{name}-*{suffix}"):
+        with suppress(OSError):
+            if path.stem == f"{name}-{_hash(path.read_bytes())}":
+                return path
+    return None
+
+
+def keep(name: str, suffix: str, content: bytes) -> Path | None:
+    """Write a file for later processes; its name ends with a hash of the content. ``None`` if it cannot be written."""
+    path = Path(cache_folder()) / f"{name}-{_hash(content)}{suffix}"
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        scratch = tempfile.TemporaryDirectory(dir=path.parent)
+        with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+            fresh = Path(scratch) / path.name
+            fresh.write_bytes(content)
+            os.replace(fresh, path)  # atomic: another process may write it at the same time
+        return path
     except OSError as error:
-        _logger.info("compiled kernels cannot be kept in %s (%s)", folder, error)
-        path, scratch = Path(), tempfile.TemporaryDirectory()
-    with scratch:
-        fresh = Path(scratch.name) / "fresh.so"
-        _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, program[0])
-        done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            failure = f"{shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
-            return f"could not be built: {failure}"
-        if path.name:
-            os.replace(fresh, path)  # atomic: another process may build at the same time
-            fresh = path
-        try:
-            return ctypes.CDLL(str(fresh))
-        except OSError as error:
-            return f"could not be built: the compiled library does not load: {error}"
+        _logger.info("compiled kernels cannot be kept in %s (%s)", path.parent, error)
+        return None
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _key(program: Sequence[str], options: Sequence[str], source: Path) -> str:
@@ -194,7 +216,7 @@ def _key(program: Sequence[str], options: Sequence[str], source: Path) -> str:
 def processor() -> str:
     """Model and instruction sets, because a library compiled for one processor may not run on another."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     except OSError:
         return f"{platform.machine()} {platform.processor()}"
     facts = {line.partition(":")[0].strip(): line for line in reversed(lines)}

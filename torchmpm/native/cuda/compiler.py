@@ -5,17 +5,14 @@ import hashlib
 import importlib.metadata
 import io
 import logging
-import os
-import tempfile
 import threading
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 
 import torch
 
 from torchmpm.native.cuda.arguments import Kernel
-from torchmpm.native.library import cache_folder
+from torchmpm.native.library import find_kept, keep
 
 #: The kernels, and the headers that they share with those of the CPU.
 FOLDERS = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "common")
@@ -59,13 +56,13 @@ def compile_kernel(kernel: Kernel, arch: str) -> bytes:
     Raises:
         ValueError: It cannot be compiled; the message holds what NVRTC said.
     """
-    path = Path(cache_folder()) / f"{kernel.name}-{arch}-{_key(kernel, arch)}.cubin"
+    name = f"{kernel.name}-{arch}-{_key(kernel, arch)}"
     with _lock:
-        with suppress(OSError):
+        if (path := find_kept(name, ".cubin")) is not None:
             return path.read_bytes()
         _logger.info("compiling %s for %s (once on this machine, some seconds)", kernel.name, arch)
         binary = compile_source(source_of(kernel), arch, kernel.macros, folder=path_of(kernel).parent)
-        _keep(path, binary)
+        keep(name, ".cubin", binary)
     return binary
 
 
@@ -121,14 +118,3 @@ def _versions() -> tuple[object, ...]:
     from cuda.bindings import nvrtc
 
     return importlib.metadata.version("cuda-core"), *nvrtc.nvrtcVersion()
-
-
-def _keep(path: Path, binary: bytes) -> None:
-    """Write a file for later processes, of which others may be writing the same one."""
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(binary)
-        os.replace(file.name, path)
-    except OSError as error:
-        _logger.info("compiled kernels cannot be kept in %s (%s)", path.parent, error)
