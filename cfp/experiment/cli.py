@@ -98,6 +98,8 @@ def run_command(command: Callable[[], int | None]) -> int:
         `OSError`, not enough memory); 128 plus the number of the signal that stopped the program.
     """
     keep_memory()
+    if sys.stderr is None:  # closed by a shell; what is printed there would go to the standard output
+        sys.stderr = open(os.devnull, "w")
     try:
         code = command() or 0
         print(end="", flush=True)  # while a reader that has gone is still noticed here; there may be no output

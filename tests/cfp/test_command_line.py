@@ -154,7 +154,11 @@ def test_letters_that_the_output_lacks_are_escaped(encoding, monkeypatch):
     assert output.buffer.getvalue() == b"\\u2192 \\udce4\n"
 
 
-def test_a_program_needs_no_output(monkeypatch):
-    """As after ``>&-`` in a shell."""
+def test_a_program_needs_no_output(monkeypatch, capsys):
+    """As after ``>&-`` and ``2>&-`` in a shell; the latter's words do not go elsewhere."""
+    monkeypatch.setattr(sys, "stderr", None)
+    assert run_command(lambda: print("for a person", file=sys.stderr)) == 0
+    assert capsys.readouterr().out == ""
+    sys.stderr.close()
     monkeypatch.setattr(sys, "stdout", None)
     assert run_command(lambda: print("a few words")) == 0

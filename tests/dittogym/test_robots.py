@@ -1,5 +1,6 @@
 """Robots and obstacles of one's own, and what particles bodies are made of."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -57,6 +58,16 @@ def test_pictures_of_all_kinds_are_the_same_robot(tmp_path: Path) -> None:
         robot = dittogym.make_spec("run", body=picture).robot
         assert isinstance(robot.shape, Figure) and np.array_equal(robot.shape.mask, large(margin=0)[:, 3:]), name
         assert (robot.count, robot.mass) == (own.count, own.mass)
+
+
+@pytest.mark.parametrize("name", ["stär.png", os.fsdecode(b"st\xe4r.png"), "two\nlines.png"])
+def test_names_of_files_may_have_any_letters(name: str, tmp_path: Path) -> None:
+    """Also bytes that are not in the encoding of the system, as in a name from another one; no C library opens them."""
+    path = f"{tmp_path}/{name}"
+    Image.fromarray(large()).save(path)
+    named, drawn = (dittogym.make_spec("shapematch", body=each, target=each) for each in (path, large()))
+    assert np.array_equal(named.robot.shape.mask, drawn.robot.shape.mask)
+    assert np.array_equal(named.target, drawn.target)
 
 
 @pytest.mark.parametrize("task", TASKS)
