@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dittogym.render.scene import VIEW_WIDTH, Scene, Shot
+from dittogym.render.scene import REST, VIEW_WIDTH, Scene, Shot
 
 PLAYER = Path(__file__).parent / "replay.html"
 #: Draws a scene in a browser; :mod:`cfp.play` serves the same file.
@@ -64,7 +64,7 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
     chosen, counts = _selection(scene, shots[0])
     arrays = [_positions(kept, chosen)]
     for name, particles in zip(SHOWN, (chosen[: counts[0]], chosen), strict=True):
-        rest = np.full(len(shots[0].x), 127, np.uint8)
+        rest = np.full(len(shots[0].x), REST, np.uint8)
         values = np.stack([shot.values.get(name, rest)[particles] for shot in kept]) // VALUE_STEP
         arrays.append(np.diff(values, axis=0, prepend=np.uint8(0)).tobytes())
     header = scene.as_json() | {
