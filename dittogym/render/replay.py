@@ -26,8 +26,8 @@ MOST_MOMENTS, MOST_PARTICLES = 400, 3000
 QUANTUM = 2.5e-4
 #: Code of a position that is not finite or too far away.
 NOWHERE = -(2**15)
-#: Values are kept in so many steps of 254.
-VALUE_STEP = 16
+#: Values are kept in steps of so many of 254.
+VALUE_STEP = 8
 
 
 def replay_page(
@@ -70,13 +70,14 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
     header = scene.as_json() | {
         "quantum": QUANTUM,
         "particles": len(shots[0].x),
+        "levels": 254 // VALUE_STEP,  # the highest value
         "stride": stride,
         "steps": steps,
         "centre": [_rounded(shot.centre) for shot in kept],
         "corner": [_rounded(shot.corner(VIEW_WIDTH)) for shot in kept],
         "width": VIEW_WIDTH,
         "bodies": [
-            {"count": count, "radius": body.radius * math.sqrt(body.count / count), "colour": body.colour}
+            vars(body) | {"count": count, "radius": body.radius * math.sqrt(body.count / count)}
             for body, count in zip(scene.bodies, counts, strict=True)
         ],
     }
