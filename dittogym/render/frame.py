@@ -18,8 +18,8 @@ GRID, BAND, TILE, OUTLINE, INK = (226, 224, 217), (240, 237, 228), (130, 137, 14
 #: Distance of the marks that show how far the robot has moved, and of the larger ones, m.
 MARK, LANDMARK = 0.1, 0.5
 MUSCLES = SCALES["muscle"].palette()
-#: Width of the cells in which the surface of a body is computed, m.
-CELL = 1e-3
+#: Width of the cells in which the surface of a body is computed, m, and the most that a picture has in a row.
+CELL, MOST_CELLS = 1e-3, 1024
 #: Matter is drawn as one piece where its particles act on each other: up to 3 nodes apart they still share one, m.
 BRIDGE = 3 / NODES
 #: Standard deviations of the filters that smooth a surface and its colours, cells.
@@ -134,8 +134,10 @@ class Canvas:
         font = self.font
         if MARK * self.scale < 3.5 * font:
             marks = [(x, column) for x, column in marks if round(x / MARK) % 5 == 0]
+        written = -math.inf
         for x, column in marks:
-            if 2 * font <= column <= self.pixels - 2 * font:
+            if 2 * font <= column <= self.pixels - 2 * font and column - written >= 3.5 * font:
+                written = column
                 dark = self.image[-font, column].mean() < 150
                 colour = (240, 240, 240) if dark else SOLID
                 self.text(f"{x + 0.0:.1f} m", (column, self.pixels - 3 * font // 2), colour, 0.5)
@@ -166,7 +168,7 @@ class Canvas:
             cv2.fillPoly(self.image, polygons, TARGET, cv2.LINE_AA, SHIFT)  # what lies in two of them stays empty
 
     def surface(self, position: np.ndarray, colours: np.ndarray, radius: float, edge: float, outline: float) -> None:
-        """A body with a smooth outline: the closing of its particles by discs, of which `edge` lies around them.
+        """A body with a smooth outline: the closing of its particles by discs, and what lies around them.
 
         Args:
             position: (N, 2) in the world, m; particles that are not finite or out of sight are left out.
@@ -175,25 +177,26 @@ class Canvas:
             edge: How far the body reaches beyond its outer particles, m.
             outline: Width of its outline, pixels.
         """
-        reach = radius / CELL
-        at = (position.astype(np.float64) - self.corner) / CELL
-        seen = ((at >= -2 * reach) & (at < self.width / CELL + 2 * reach)).all(1)  # false where it is not finite
+        size = max(CELL, self.width / MOST_CELLS)
+        reach, zoom = radius / size, size * self.scale
+        position = position.astype(np.float64)
+        far = 2 * radius
+        seen = ((position >= self.corner - far) & (position < self.corner + self.width + far)).all(1)  # false for NaN
         if not seen.any():
             return
         # Cells are fixed in the world, so that the outline does not tremble while the camera moves.
-        cell = np.floor(position[seen].astype(np.float64) / CELL).astype(int)
+        cell = np.floor(position[seen] / size).astype(int)
         border = int(reach) + 4
         low = cell.min(0) - border
         column, row = (cell - low).T
         empty = np.full((row.max() + border + 1, column.max() + border + 1), 255, np.uint8)
         empty[row, column] = 0
-        zoom = CELL * self.scale
-        (left, bottom), (right, top) = self.place(np.stack((low, low + empty.shape[::-1])) * CELL)
+        (left, bottom), (right, top) = self.place(np.stack((low, low + empty.shape[::-1])) * size)
         left, top = (math.floor(min(max(side, 0), self.pixels)) for side in (left, top))
         width, height = (math.ceil(min(side, self.pixels)) - start for side, start in ((right, left), (bottom, top)))
         if min(width, height) <= 0:
             return
-        first = self.place((low + 0.5) * CELL) - (left + 0.5, top + 0.5)
+        first = self.place((low + 0.5) * size) - (left + 0.5, top + 0.5)
         matrix = np.array(((zoom, 0, first[0]), (0, -zoom, first[1])))
 
         def resampled(cells: np.ndarray) -> np.ndarray:
@@ -207,16 +210,17 @@ class Canvas:
             palette = np.zeros((len(row) + 1, 3), np.uint8)
             palette[nearest[row, column]] = colours[seen]
             drawn = resampled(cv2.GaussianBlur(palette[nearest], (0, 0), SMOOTH_COLOUR))
-        covered = (distance < reach).view(np.uint8)
-        depth = cv2.distanceTransform(covered, cv2.DIST_L2, 5) - (reach - edge / CELL)
+        covered = distance < reach
+        inside = cv2.distanceTransform(covered.view(np.uint8), cv2.DIST_L2, 5)
+        depth = np.where(covered, inside, np.float32(reach) - distance) - np.float32(reach - edge / size)
         depth = zoom * resampled(cv2.GaussianBlur(depth, (0, 0), SMOOTH_EDGE))  # below the surface, pixels
         part = self.image[top : top + height, left : left + width]
         rim = np.nonzero((depth > -0.5) & (depth < outline + 0.5))
-        below, depth_there = part[rim], depth[rim][:, None]
-        shade = 0.75 * np.clip(outline + 0.5 - depth_there, 0, 1) * (outline > 0)
+        below, under = part[rim], depth[rim][:, None]
+        shade = 0.75 * np.clip(outline + 0.5 - under, 0, 1) * (outline > 0)
         outlined = drawn[rim] + shade * (np.array(OUTLINE, np.float32) - drawn[rim])
         cv2.copyTo(drawn, (depth > 0).view(np.uint8), part)
-        part[rim] = below + np.clip(depth_there + 0.5, 0, 1) * (outlined - below)
+        part[rim] = below + np.clip(under + 0.5, 0, 1) * (outlined - below)
 
     def grains(self, position: np.ndarray, colour: tuple[int, ...], radius: float) -> None:
         """Filled circles of a radius in m at world positions (N, 2); only those that can be seen."""

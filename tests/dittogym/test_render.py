@@ -80,6 +80,14 @@ def test_a_robot_that_has_flown_far_away(task: str) -> None:
     assert not len(near(env.render(), ROBOT)[0])
 
 
+def test_matter_that_lies_far_apart() -> None:
+    """Two pieces in a picture of twenty metres."""
+    canvas = Canvas(256, np.zeros(2), 20.0)
+    canvas.surface(np.array(((1.0, 1.0), (19.0, 19.0))), np.array(ROBOT, np.uint8), 0.2, 0.2, 0)
+    assert all(tuple(canvas.image[row, column]) == ROBOT for row, column in ((243, 12), (12, 243)))
+    assert tuple(canvas.image[128, 128]) == GROUND
+
+
 def test_particles_that_are_not_finite_are_left_out() -> None:
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)
