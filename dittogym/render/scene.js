@@ -121,25 +121,25 @@ export class Scene {
   }
 
   drawParticles(positions, codes, { robot_only, stops }) {
-    const { task: { bodies }, canvas, raster, ratio } = this, shades = table(stops);
+    const { task: { bodies }, canvas, raster, ratio } = this, scale = table(stops);
     const outline = this.colour("outline").match(/\w\w/g).map((digits) => parseInt(digits, 16));
     raster.begin(canvas.width, canvas.height);
     let end = positions.length / 2;
     for (let index = bodies.length - 1; index >= 0; index--) {  // the robot last, on top
       const { count, radius, colour, grains } = bodies[index], first = end - count;
-      const shadeOf = robot_only && index > 0 ? () => colour : (code) => shades[code];
+      const plain = robot_only && index > 0, shades = plain ? scale.map(() => colour) : scale;
       if (grains && index > 0) {
-        for (const [size, share] of [[1.4, 0.5], [0.6, 1]]) {  // the second time darker and smaller
+        for (const [size, share] of [[1.4, 0.5], [0.6, 1]]) {  // the second time smaller and darker
           const reach = Math.max(size * radius * this.scale, 1.2 * ratio);
-          const paints = shades.map((_, code) => packed(shadeOf(code).map((value) => share * value + (1 - share) * 255)));
+          const paints = shades.map((shade) => packed(shade.map((value) => share * value + (1 - share) * 255)));
           for (let i = first; i < end; i++) {
             const [x, y] = this.toPixel(positions[2 * i], positions[2 * i + 1]);
             if (x > -reach && x < canvas.width + reach) raster.disc(x, y, reach, paints[Math.round(codes[i])]);
           }
         }
       } else {
-        const line = index > 0 && !robot_only ? colour : outline;
-        this.drawSurface({ positions, codes, first, end }, shades.map((_, code) => shadeOf(code)), radius, 1.3 * ratio, line);
+        const line = index > 0 && !plain ? colour : outline;
+        this.drawSurface({ positions, codes, first, end }, shades, radius, 1.3 * ratio, line);
       }
       end = first;
     }
@@ -162,7 +162,8 @@ export class Scene {
     if (!xs.length) return;
     const field = new Field(xs, ys, Math.ceil(reach) + 3), distance = field.distances(xs, ys);
     const near = Float32Array.from(field.nearest, (i) => values[i] ?? 0);
-    for (const _ of "ab") field.blur(near);
+    field.blur(near);
+    field.blur(near);
     // Below the surface, pixels: from the distance to the rim of the cells that the discs cover.
     const rim = field.rim(distance, reach), depth = field.distances(rim.xs, rim.ys);
     for (let k = 0; k < depth.length; k++) {
@@ -187,7 +188,8 @@ export class Scene {
           raster.pixels[at] = paints[code];
         } else {
           const line = 0.75 * Math.min(width + 0.5 - pixels, 1);
-          raster.cover(at, shades[code].map((value, channel) => value + line * (outline[channel] - value)), Math.min(pixels + 0.5, 1));
+          const shade = shades[code].map((value, channel) => value + line * (outline[channel] - value));
+          raster.cover(at, shade, Math.min(pixels + 0.5, 1));
         }
       }
     }
@@ -211,7 +213,8 @@ class Field {
     const square = (point, column, row) => (xs[point] - left - column) ** 2 + (ys[point] - bottom - row) ** 2;
     nearest.fill(-1);
     for (let i = 0; i < xs.length; i++) {
-      const column = Math.round(xs[i]) - left, row = Math.round(ys[i]) - bottom, k = row * columns + column, found = square(i, column, row);
+      const column = Math.round(xs[i]) - left, row = Math.round(ys[i]) - bottom;
+      const k = row * columns + column, found = square(i, column, row);
       if (found < squares[k]) squares[k] = found, nearest[k] = i;
     }
     const update = (column, row, neighbours) => {
@@ -239,7 +242,8 @@ class Field {
     for (let row = 1; row < rows - 1; row++) {
       for (let column = 1; column < columns - 1; column++) {
         const k = row * columns + column;
-        if (distance[k] < reach || ![k - 1, k + 1, k - columns, k + columns].some((other) => distance[other] < reach)) continue;
+        const around = [k - 1, k + 1, k - columns, k + columns];
+        if (distance[k] < reach || !around.some((other) => distance[other] < reach)) continue;
         found.xs.push(this.left + column);
         found.ys.push(this.bottom + row);
         found.beyond.push(distance[k] - reach);
