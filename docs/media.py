@@ -28,12 +28,14 @@ SOURCES = FILMS / "sources.json"
 POLICIES = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 #: Pixels of a task's own film and of a cell of the grid, and cells in a row.
 SIZE, CELL, COLUMNS = 360, 240, 4
+#: White pixels between pictures beside each other.
+BETWEEN = 8
 #: Duration of a film, s, and pictures per second.
 SECONDS, RATE = 6.0, 10
 #: Of the moments beside each other: the policy, their number, what each shows of the world, m, and its pixels.
 HERO, MOMENTS = "obstacle", 4
 LEFT, RIGHT, BOTTOM, TOP = -0.08, 0.80, 0.10, 0.45
-WIDE, BETWEEN = 320, 8
+WIDE = 320
 
 
 def record_policy(name: str) -> Recording:
@@ -55,9 +57,10 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
         cells = []
         for task, recording in recordings.items():
             time = moment * recording.duration
-            cells.append(recording.picture(time, size=CELL, caption=(headline(task)[0], f"{time:.1f} s")))
+            picture = recording.picture(time, size=CELL, caption=(headline(task)[0], f"{time:.1f} s"))
+            cells.append(np.pad(picture, ((0, BETWEEN), (0, BETWEEN), (0, 0)), constant_values=255))
         rows = [np.concatenate(cells[i : i + COLUMNS], 1) for i in range(0, len(cells), COLUMNS)]
-        frames.append(np.concatenate(rows, 0))
+        frames.append(np.concatenate(rows, 0)[:-BETWEEN, :-BETWEEN])
     return frames
 
 
