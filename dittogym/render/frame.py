@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -245,7 +246,7 @@ class Canvas:
         self.text(left, (font // 2, font // 6), INK, 0.0)
         self.text(right, (self.pixels - font // 2, font // 6), INK, 1.0)
 
-    def legend(self, entries: list[tuple[str, tuple[int, ...]]], muscles: bool) -> None:
+    def legend(self, entries: Sequence[tuple[str, tuple[int, ...]]], muscles: bool) -> None:
         """Colours and what they mean, on a second strip below that of the caption, if the picture has room for it."""
         if self.pixels < 20 * self.font:
             return

@@ -179,8 +179,8 @@ class Recording:
         return np.concatenate(strip[:-1], axis=1)
 
     def _picture(self, time: float, options: FilmOptions, caption: tuple[str, str], legend: bool = False) -> np.ndarray:
-        shown = {"size": options.size, "zoom": options.zoom, "muscles": options.muscles}
-        return self.picture(time, **shown, caption=caption, legend=legend)
+        size, zoom, muscles = options.size, options.zoom, options.muscles
+        return self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption, legend=legend)
 
     def _clock(self, time: float) -> str:
         """A time in s with so many digits that steps can be told apart."""
