@@ -17,7 +17,6 @@ from typing import Any
 
 import dittogym
 from baselines.compare import paper
-from baselines.leaderboard import is_reference
 from cfp.robustness import COLUMNS, DISTURBANCES, MATTER, OWN_START, UNDISTURBED, ratios
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Box, Obstacle
@@ -248,7 +247,7 @@ def leaderboard() -> str:
         scores = entry["scores"]
         good = f", success {scores['success']:.0%}" if scores["success"] else ""
         ranked, references = rows[entry["task"]]
-        cell = references if is_reference(entry) else ranked
+        cell = ranked if entry["sha256"] else references
         cell.append(f"{entry['policy']} {scores['mean']:,.0f} ± {scores['interval']:,.0f}{good}")
     lines = ([name_of(task), *("; ".join(cell) for cell in cells)] for task, cells in rows.items() if any(cells))
     return markdown(("Task", "Policies", "Reference policies"), lines)
