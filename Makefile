@@ -14,7 +14,7 @@ TEST_PROCESSES ?= 2
 PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all cuda-kernels gpu test-oldest coverage lint docs bench wheel test-wheel clean
+.PHONY: help install demo test test-all cuda-kernels gpu test-oldest coverage lint docs docs-tutorials bench wheel test-wheel clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -98,8 +98,16 @@ lint: install  ## style, formatting, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings and dead links are errors
-	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+SPHINX = $(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
+docs: $(DOCS_STAMP)  ## build the site into docs/_build/html in one to two minutes; warnings and dead links are errors
+	@echo "Building the pages, without running the tutorials (make docs-tutorials does): one to two minutes ..."
+	@$(SPHINX)
+	@echo "Open docs/_build/html/index.html"
+
+docs-tutorials: $(DOCS_STAMP)  ## the same with the output of the tutorials, which run side by side: five minutes on two cores
+	@echo "Running the tutorials that have changed, one on each core, and building the pages: five minutes on two cores ..."
+	@TUTORIALS=run OMP_NUM_THREADS=1 $(SPHINX)
 	@echo "Open docs/_build/html/index.html"
 
 bench: install  ## time of substeps, of environment steps and of trainings

@@ -81,7 +81,7 @@ class Command:
     """Evaluate policies under the protocol v1 of the leaderboard, and rank them by their mean return.
 
     Writes a file of results for each policy that is not given as such a file, and prints a table of each task, ranked
-    among the policies that observe the same.
+    among the policies that observe the same. Reference policies are listed below them, without a rank.
     """
 
     policies: tyro.conf.Positional[tuple[str, ...]]
@@ -177,13 +177,19 @@ def read_results(path: Path) -> dict[str, Any]:
     return row
 
 
+def is_reference(row: dict[str, Any]) -> bool:
+    """Whether results are those of a reference policy, which has no file."""
+    return row["sha256"] is None
+
+
 def rankings(results: Iterable[dict[str, Any]]) -> list[Table]:
-    """A table for every task that has results, named by the task."""
+    """A table for every task that has results, named by the task; reference policies come last and have no rank."""
     rows = [row | row["training"] | row["scores"] for row in results]
-    rows.sort(key=lambda row: (SEES.index(row["sees"]), -row["mean"]))
+    rows.sort(key=lambda row: (is_reference(row), SEES.index(row["sees"]), -row["mean"]))
     for row in rows:
         rivals = [other for other in rows if (other["task"], other["sees"]) == (row["task"], row["sees"])]
-        row["rank"] = 1 + sum(other["mean"] > row["mean"] for other in rivals)
+        better = sum(other["mean"] > row["mean"] for other in rivals if not is_reference(other))
+        row["rank"] = "reference" if is_reference(row) else 1 + better
     description = f"Mean return of {len(SEEDS)} episodes under protocol {PROTOCOL}."
     tables = (Table(task, task, description, SHOWN, [row for row in rows if row["task"] == task]) for task in TASKS)
     return [table for table in tables if table.rows]

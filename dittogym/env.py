@@ -244,9 +244,9 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         shown, torch_env = self.torch_env.shot(0, ("muscle",)), self.torch_env
         scene = describe(torch_env.model)
         caption = (
-            f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:.1f}",
+            f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:,.1f}",
             pace(RENDER_FPS * scene.dt),
         )
-        picture = frame(scene, shown, self.render_size, muscles=self.render_muscles, caption=caption)
+        picture = frame(scene, shown, self.render_size, muscles=self.render_muscles, caption=caption, legend=True)
         if not self._screen.show(picture):
             self.close()

@@ -1,11 +1,12 @@
-"""Sphinx configuration. Build with ``make docs``."""
+"""Sphinx configuration. Build with ``make docs``, or ``make docs-tutorials``, which also runs the tutorials."""
 
+import contextlib
+import io
 import os
 import pkgutil
 import re
-import subprocess
 import sys
-from pathlib import Path
+from unittest import mock
 
 from docutils import nodes
 from sphinx import addnodes
@@ -14,8 +15,8 @@ from sphinx.transforms import SphinxTransform
 from sphinx.util.docutils import SphinxDirective
 
 import torchmpm
+from baselines import console
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Names of the packages in code.
 NAME = re.compile(r"(torchmpm|dittogym|cfp|baselines)(\.\w+)+")
 
@@ -43,7 +44,8 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "remove_config_comments": True,
     "min_reported_time": 1,
-    "plot_gallery": os.environ.get("TUTORIALS", "run") == "run",
+    "plot_gallery": os.environ.get("TUTORIALS") == "run",  # otherwise their pages keep the output of the last time
+    "parallel": os.cpu_count(),
 }
 suppress_warnings = ["config.cache"]
 nitpicky = True
@@ -78,12 +80,19 @@ class CommandHelp(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Run the command and show its output as a literal block."""
         self.env.note_reread()  # the program may have changed even if the page has not
-        environment = os.environ | {"COLUMNS": "88", "NO_COLOR": "1", "TERM": "dumb"}
-        command = [sys.executable, "-m", "baselines.console", *self.arguments[0].split(), "--help"]
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        if done.returncode != 0:
-            raise self.error(f"torchmpm {self.arguments[0]} --help failed:\n{done.stderr}")
-        return [nodes.literal_block(text=done.stdout)]
+        written = io.BytesIO()
+        shown = io.TextIOWrapper(written, "utf-8", write_through=True)  # whose encoding allows frames
+        appearance = {"COLUMNS": "88", "NO_COLOR": "1", "TERM": "dumb"}
+        untouched = mock.patch.multiple(sys, argv=[], path=[*sys.path])
+        with untouched, mock.patch.dict(os.environ, appearance), contextlib.redirect_stdout(shown):
+            try:  # in this process: it has imported the packages already, which takes seconds
+                code = console.main([*self.arguments[0].split(), "--help"])
+            except SystemExit as end:
+                code = end.code
+        text = written.getvalue().decode()
+        if code:
+            raise self.error(f"torchmpm {self.arguments[0]} --help failed:\n{text}")
+        return [nodes.literal_block(text=text)]
 
 
 class LinkNames(SphinxTransform):

@@ -1,19 +1,23 @@
 """Films of the policies that come with the package: `python docs/media.py [POLICY ...]`.
 
-Each policy gets `images/films/POLICY.webp`, and those of all tasks together `images/tasks.webp`. The hash of the policy
-behind each film is kept in `images/films/sources.json`; a test compares them with those of the package.
+Each policy gets `images/films/POLICY.webp`, that of OBSTACLE some moments beside each other in `images/hero.png`, and
+those of all tasks together `images/tasks.webp`. The hash of the policy behind each film is kept in
+`images/films/sources.json`; a test compares them with those of the package.
 """
 
 import argparse
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import cfp
 import dittogym
 from dittogym.render.film import write_film
+from dittogym.render.frame import INK, Canvas
 from dittogym.render.recording import Recording
 from dittogym.tasks import headline
 
@@ -24,8 +28,14 @@ SOURCES = FILMS / "sources.json"
 POLICIES = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 #: Pixels of a task's own film and of a cell of the grid, and cells in a row.
 SIZE, CELL, COLUMNS = 360, 240, 4
+#: White pixels between pictures beside each other.
+BETWEEN = 8
 #: Duration of a film, s, and pictures per second.
 SECONDS, RATE = 6.0, 10
+#: Of the moments beside each other: the policy, their number, what each shows of the world, m, and its pixels.
+HERO, MOMENTS = "obstacle", 4
+LEFT, RIGHT, BOTTOM, TOP = -0.08, 0.80, 0.10, 0.45
+WIDE = 320
 
 
 def record_policy(name: str) -> Recording:
@@ -47,10 +57,32 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
         cells = []
         for task, recording in recordings.items():
             time = moment * recording.duration
-            cells.append(recording.picture(time, size=CELL, caption=(headline(task)[0], f"{time:.1f} s")))
+            picture = recording.picture(time, size=CELL, caption=(headline(task)[0], f"{time:.1f} s"))
+            cells.append(np.pad(picture, ((0, BETWEEN), (0, BETWEEN), (0, 0)), constant_values=255))
         rows = [np.concatenate(cells[i : i + COLUMNS], 1) for i in range(0, len(cells), COLUMNS)]
-        frames.append(np.concatenate(rows, 0))
+        frames.append(np.concatenate(rows, 0)[:-BETWEEN, :-BETWEEN])
     return frames
+
+
+def moments(recording: Recording) -> np.ndarray:
+    """Moments between which the robot comes equally far, seen by a camera that rests, with their times below."""
+    places = np.array([shot.centre[0] for shot in recording.shots])
+    span = RIGHT - LEFT
+    rows = slice(*(round((span - y) / span * WIDE) for y in (TOP, BOTTOM)))
+    side = MOMENTS * (WIDE + BETWEEN) - BETWEEN
+    below = Canvas(side, np.zeros(2))
+    below.font, below.image[:] = 20, 255
+    pictures = []
+    for number, place in enumerate(np.linspace(places[0], places.max(), MOMENTS)):
+        step = int(np.argmax(places >= place - 1e-6))
+        there = {"origin": np.array((LEFT, 0.0)), "view": np.full(2, span / 2)}
+        still = replace(recording, shots=[recording.shots[step]._replace(**there)])
+        picture = still.picture(0.0, size=WIDE, zoom=1 / span)[rows]
+        pictures += [picture, np.full((len(picture), BETWEEN, 3), 255, np.uint8)]
+        middle = number * (WIDE + BETWEEN) + WIDE // 2
+        below.text(f"{step * recording.scene.dt:.2f} s", (middle, 4), INK, 0.5)
+    below.legend([], muscles=True)
+    return np.concatenate([np.concatenate(pictures[:-1], 1), below.image[: below.strip(2)]])
 
 
 def main() -> None:
@@ -66,6 +98,8 @@ def main() -> None:
         speed = max(0.1, round(recordings[name].duration / SECONDS, 1))
         recordings[name].save(FILMS / f"{name}.webp", size=SIZE, rate=RATE, speed=speed)
         sources[name] = policy_hash(name)
+    if HERO in (names or recordings):
+        Image.fromarray(moments(recordings[HERO])).save(IMAGES / "hero.png", optimize=True)
     write_film(IMAGES / "tasks.webp", grid_frames({task: recordings[task] for task in dittogym.TASKS}), RATE)
     SOURCES.write_text(json.dumps(dict(sorted(sources.items())), indent=2) + "\n")
 

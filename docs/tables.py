@@ -240,14 +240,17 @@ def published() -> str:
 
 
 def leaderboard() -> str:
-    """Mean returns under the fixed protocol, with half their 95 % interval, best first."""
-    rows: dict[str, list[str]] = {task: [] for task in dittogym.TASKS}
+    """Mean returns under the fixed protocol, with half their 95 % interval, best first; reference policies apart."""
+    rows: dict[str, tuple[list[str], list[str]]] = {task: ([], []) for task in dittogym.TASKS}
     entries = [json.loads(path.read_text()) for path in (DOCS / "leaderboard").glob("*.json")]
     for entry in sorted(entries, key=lambda entry: -entry["scores"]["mean"]):
         scores = entry["scores"]
         good = f", success {scores['success']:.0%}" if scores["success"] else ""
-        rows[entry["task"]].append(f"{entry['policy']} {scores['mean']:,.0f} ± {scores['interval']:,.0f}{good}")
-    return markdown(("Task", "Policies"), ([name_of(task), "; ".join(found)] for task, found in rows.items() if found))
+        ranked, references = rows[entry["task"]]
+        cell = ranked if entry["sha256"] else references
+        cell.append(f"{entry['policy']} {scores['mean']:,.0f} ± {scores['interval']:,.0f}{good}")
+    lines = ([name_of(task), *("; ".join(cell) for cell in cells)] for task, cells in rows.items() if any(cells))
+    return markdown(("Task", "Policies", "Reference policies"), lines)
 
 
 def pivot(

@@ -54,6 +54,19 @@ PAGES = {
         "batch.reset(seed=0)\n_, first, *_ = batch.step(torch.zeros(2, *batch.action_shape))\nassert first.max() <= 0",
         'assert dittogym.make_spec("hop").horizon == 20 and policy.description["task"] == "hop"',
     ),
+    "docs/does-it.md": (
+        "assert observation.shape == (100, 4) and abs(observation[:, :2].mean(0)).max() < 1e-6",
+        "from gymnasium.utils.env_checker import check_env",
+        "check_env(Particles(gymnasium.make('dittogym/run-coarse-v0', **quick)), skip_render_check=True)",
+        "import stable_baselines3",
+        "raced = Particles(gymnasium.make('dittogym/run-coarse-v0', **quick))",
+        "stable_baselines3.PPO('MlpPolicy', raced, n_steps=8, batch_size=8, device='cpu').learn(8)",
+        "assert left.std(0).max() < 0.97 * right.std(0).min()",
+        "env = gymnasium.make('dittogym/run-coarse-v0', particles=300)",
+        "env.reset(seed=0, options={'physics': {'gravity': uphill}})",
+        "for _ in range(50): *_, info = env.step(np.zeros(env.action_space.shape, np.float32))",
+        "assert info['displacement'] < -0.005",  # on even ground a robot at rest moves by less than a millimetre
+    ),
     "docs/films.md": (
         "from PIL import Image\nassert Image.open('star.webp').n_frames > 50 and Image.open('star.png').height == 256",
         "assert len(recording.rewards) == 30 and sum(recording.rewards) > 300",

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dittogym.render.scene import SCALES, Scene, Shot, Solid, check_view
+from dittogym.geometry import NODES
+from dittogym.render.scene import RADIUS, SCALES, Scene, Shot, Solid, check_view
 
 GROUND, SOLID, TARGET = (248, 246, 240), (112, 119, 130), (247, 198, 98)
-GRID, INK = (226, 224, 217), (40, 44, 52)
-#: Distance of the marks that show how far the robot has moved, m.
-MARK = 0.1
+#: Lines, every second half metre of the background, every second tenth of the floor, outlines of bodies, text.
+GRID, BAND, TILE, OUTLINE, INK = (226, 224, 217), (240, 237, 228), (130, 137, 148), (29, 63, 72), (40, 44, 52)
+#: Distance of the marks that show how far the robot has moved, and of the larger ones, m.
+MARK, LANDMARK = 0.1, 0.5
 MUSCLES = SCALES["muscle"].palette()
+#: Width of the cells in which the surface of a body is computed, m, and the most that a picture has in a row.
+CELL, MOST_CELLS = 1e-3, 1024
+#: Matter is drawn as one piece where its particles act on each other: up to 3 nodes apart they still share one, m.
+BRIDGE = 3 / NODES
+#: Standard deviations of the filters that smooth a surface and its colours, cells.
+SMOOTH_EDGE, SMOOTH_COLOUR = 2.5, 3.0
 #: Bits behind the point of the coordinates of polygons, which OpenCV takes as integers.
 SHIFT = 4
 
@@ -26,6 +36,7 @@ def frame(
     zoom: float | None = None,
     muscles: bool = True,
     caption: tuple[str, str] | None = None,
+    legend: bool = False,
 ) -> np.ndarray:
     """Draw one moment, (size, size, 3) uint8 RGB.
 
@@ -36,6 +47,7 @@ def frame(
         zoom: The picture shows 1 / zoom metres; ``None``: a little more than the robot observes.
         muscles: Colour the robot by its muscles: contraction red, expansion blue.
         caption: What to write into the upper left and the upper right corner.
+        legend: Say below the caption what the colours mean.
     """
     width = check_view(size, zoom)
     canvas = Canvas(size, shot.corner(width), width)
@@ -46,15 +58,24 @@ def frame(
     canvas.ruler(marks)
     ends = np.cumsum([body.count for body in scene.bodies])
     for number, (end, body) in reversed(list(enumerate(zip(ends, scene.bodies, strict=True)))):  # the robot on top
-        colours = np.array(body.colour, np.uint8)
+        x, colours = shot.x[end - body.count : end], np.array(body.colour, np.uint8)
         if number == 0:
             if scene.goal is not None:
                 canvas.goal(scene.goal)
             if muscles and "muscle" in shot.values:
                 colours = MUSCLES[shot.values["muscle"]]
-        canvas.dots(shot.x[end - body.count : end], colours, body.radius)
+        if body.grains and number:
+            canvas.surface(x, np.mean((body.colour, GROUND), 0), 3 * body.radius, body.radius, 0)
+            canvas.grains(x, body.colour, 0.6 * body.radius)
+        else:  # its outer particles lie half their distance below its surface
+            canvas.surface(x, colours, max(body.radius, BRIDGE / 2), body.radius / (2 * RADIUS), max(1, size / 400))
     if caption is not None:
         canvas.caption(*caption)
+    if legend:
+        entries = [("soil" if body.grains else "object", body.colour) for body in scene.bodies[1:]]
+        entries += [("goal", TARGET)] if scene.goal is not None else []
+        entries += [("target", TARGET)] if scene.target else []
+        canvas.legend(entries, muscles)
     return canvas.image
 
 
@@ -82,6 +103,7 @@ class Canvas:
 
     def __init__(self, pixels: int, corner: np.ndarray, width: float = 1.0) -> None:
         self.pixels, self.corner, self.width, self.scale = pixels, corner, width, pixels / width
+        self.font = max(12, pixels // 27)
         self.image = np.empty((pixels, pixels, 3), np.uint8)
         cv2.rectangle(self.image, (0, 0), (pixels, pixels), GROUND, cv2.FILLED)  # much faster than NumPy
 
@@ -90,37 +112,46 @@ class Canvas:
         return np.asarray((points - self.corner) * (self.scale, -self.scale) + (0, self.pixels))
 
     def marks(self) -> list[tuple[float, int]]:
-        """Draw lines at round positions; returns the position, m, and the column of each."""
+        """Draw lines and bands at round positions; returns the position, m, and the column of each line."""
+        self.stripes(LANDMARK, 0, BAND)
         left = float(self.corner[0])
         found = []
         for k in range(int(np.ceil(left / MARK)), int(np.floor((left + self.width) / MARK)) + 1):
             column = round((k * MARK - left) * self.scale)
-            cv2.line(self.image, (column, 0), (column, self.pixels), GRID, 1 if k % 5 else 2)
+            cv2.line(self.image, (column, 0), (column, self.pixels), GRID, 1)
             found.append((k * MARK, column))
         return found
 
+    def stripes(self, width: float, top: int, colour: tuple[int, ...]) -> None:
+        """Fill every second interval of a width, m, from a row on downwards, so that motion along the ground shows."""
+        left = float(self.corner[0])
+        for k in range(int(np.floor(left / width)), int(np.floor((left + self.width) / width)) + 1):
+            if k % 2:
+                ends = [round((end * width - left) * self.scale) for end in (k, k + 1)]
+                cv2.rectangle(self.image, (ends[0], top), (ends[1] - 1, self.pixels), colour, cv2.FILLED)
+
     def ruler(self, marks: list[tuple[float, int]]) -> None:
-        """Write at the bottom where lines are, unless they are too close to each other."""
-        font = max(10, self.pixels // 40)
+        """Write the positions of lines at the bottom, as far as there is room for them."""
+        font = self.font
         if MARK * self.scale < 3.5 * font:
             marks = [(x, column) for x, column in marks if round(x / MARK) % 5 == 0]
-        written = -4 * font
+        written = -math.inf
         for x, column in marks:
-            dark = self.image[-font, min(column, self.pixels - 1)].mean() < 150
-            colour = (235, 235, 235) if dark else SOLID
-            cv2.line(self.image, (column, self.pixels - font // 2), (column, self.pixels), colour, 2)
-            middle = min(max(column, 2 * font), self.pixels - 2 * font)  # so that all of it is in the picture
-            if middle - written >= 3.5 * font:  # also from one that was moved
-                self.text(f"{x + 0.0:.1f} m", (middle, self.pixels - 5 * font // 3), font, colour, 0.5)
-                written = middle
+            if 2 * font <= column <= self.pixels - 2 * font and column - written >= 3.5 * font:
+                written = column
+                dark = self.image[-font, column].mean() < 150
+                colour = (240, 240, 240) if dark else SOLID
+                self.text(f"{x + 0.0:.1f} m", (column, self.pixels - 3 * font // 2), colour, 0.5)
 
     def box(self, box: Solid) -> None:
-        """A box, or only its outline."""
+        """A box, or only its outline; a floor has marks."""
         low, high = self.place(np.array(((box.left, box.bottom), (box.right, box.top))))
         (left, bottom), (right, top) = np.clip((low, high), -9, self.pixels + 9)
         corners = self._fixed(np.array(((left, bottom), (right, bottom), (right, top), (left, top))))
         if box.filled:
             cv2.fillConvexPoly(self.image, corners, SOLID, cv2.LINE_AA, SHIFT)
+            if np.isinf(box[:3]).all():
+                self.stripes(MARK, round(top), TILE)
         else:
             cv2.polylines(self.image, [corners], True, SOLID, 2, cv2.LINE_AA, SHIFT)
 
@@ -137,56 +168,121 @@ class Canvas:
             polygons = [self._fixed(self.place(outline + centre)) for outline in outlines]
             cv2.fillPoly(self.image, polygons, TARGET, cv2.LINE_AA, SHIFT)  # what lies in two of them stays empty
 
-    def dots(self, position: np.ndarray, colours: np.ndarray, radius: float) -> None:
-        """Filled circles of a radius in m at world positions (N, 2); only those that can be seen.
+    def surface(self, position: np.ndarray, colours: np.ndarray, radius: float, edge: float, outline: float) -> None:
+        """A body with a smooth outline: the closing of its particles by discs, and what lies around them.
 
         Args:
-            position: m.
-            colours: One for all (3,), or (N, 3): a pixel takes that of the particle that is nearest to it.
-            radius: m.
+            position: (N, 2) in the world, m; particles that are not finite or out of sight are left out.
+            colours: One for all (3,), or (N, 3), which are smoothed.
+            radius: Of the discs, m: gaps of twice this width are closed.
+            edge: How far the body reaches beyond its outer particles, m.
+            outline: Width of its outline, pixels.
         """
+        size = max(CELL, self.width / MOST_CELLS)
+        reach, zoom = radius / size, size * self.scale
+        position = position.astype(np.float64)
+        far = 2 * radius
+        seen = ((position >= self.corner - far) & (position < self.corner + self.width + far)).all(1)  # false for NaN
+        if not seen.any():
+            return
+        # Cells are fixed in the world, so that the outline does not tremble while the camera moves.
+        cell = np.floor(position[seen] / size).astype(int)
+        border = int(reach) + 4
+        low = cell.min(0) - border
+        column, row = (cell - low).T
+        empty = np.full((row.max() + border + 1, column.max() + border + 1), 255, np.uint8)
+        empty[row, column] = 0
+        (left, bottom), (right, top) = self.place(np.stack((low, low + empty.shape[::-1])) * size)
+        left, top = (math.floor(min(max(side, 0), self.pixels)) for side in (left, top))
+        width, height = (math.ceil(min(side, self.pixels)) - start for side, start in ((right, left), (bottom, top)))
+        if min(width, height) <= 0:
+            return
+        first = self.place((low + 0.5) * size) - (left + 0.5, top + 0.5)
+        matrix = np.array(((zoom, 0, first[0]), (0, -zoom, first[1])))
+
+        def resampled(cells: np.ndarray) -> np.ndarray:
+            return cv2.warpAffine(cells, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
+
+        if colours.ndim == 1:
+            distance = cv2.distanceTransform(empty, cv2.DIST_L2, 5)
+            drawn = np.full((height, width, 3), colours, np.uint8)
+        else:
+            distance, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+            palette = np.zeros((len(row) + 1, 3), np.uint8)
+            palette[nearest[row, column]] = colours[seen]
+            drawn = resampled(cv2.GaussianBlur(palette[nearest], (0, 0), SMOOTH_COLOUR))
+        covered = distance < reach
+        inside = cv2.distanceTransform(covered.view(np.uint8), cv2.DIST_L2, 5)
+        depth = np.where(covered, inside, np.float32(reach) - distance) - np.float32(reach - edge / size)
+        depth = zoom * resampled(cv2.GaussianBlur(depth, (0, 0), SMOOTH_EDGE))  # below the surface, pixels
+        part = self.image[top : top + height, left : left + width]
+        rim = np.nonzero((depth > -0.5) & (depth < outline + 0.5))
+        below, under = part[rim], depth[rim][:, None]
+        shade = 0.75 * np.clip(outline + 0.5 - under, 0, 1) * (outline > 0)
+        outlined = drawn[rim] + shade * (np.array(OUTLINE, np.float32) - drawn[rim])
+        cv2.copyTo(drawn, (depth > 0).view(np.uint8), part)
+        part[rim] = below + np.clip(under + 0.5, 0, 1) * (outlined - below)
+
+    def grains(self, position: np.ndarray, colour: tuple[int, ...], radius: float) -> None:
+        """Filled circles of a radius in m at world positions (N, 2); only those that can be seen."""
         radius *= self.scale
         at = self.place(position.astype(np.float64))
-        reach = int(np.ceil(radius)) + 1
         seen = ((at >= 0) & (at < self.pixels)).all(1)  # false where it is not finite
         if not seen.any():
             return
+        empty = np.full(self.image.shape[:2], 255, np.uint8)
         column, row = at[seen].astype(int).T
-        top, left = max(0, row.min() - reach), max(0, column.min() - reach)
-        part = self.image[top : row.max() + reach + 1, left : column.max() + reach + 1]
-        column, row = column - left, row - top
-        empty = np.full(part.shape[:2], 255, np.uint8)
         empty[row, column] = 0
-        if colours.ndim == 1:
-            distance = cv2.distanceTransform(empty, cv2.DIST_L2, 5)
-            drawn = np.empty_like(part)
-            cv2.rectangle(drawn, (0, 0), drawn.shape[1::-1], colours.tolist(), cv2.FILLED)
-        else:
-            distance, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-            palette = np.zeros((len(row) + 1, 4), np.uint8)  # four bytes, which are looked up as one number
-            palette[nearest[row, column], :3] = colours[seen]
-            drawn = palette.view(np.uint32)[:, 0][nearest].view(np.uint8).reshape(*nearest.shape, 4)[..., :3]
+        distance = cv2.distanceTransform(empty, cv2.DIST_L2, 5)
+        self.image[distance <= radius - 0.5] = colour
         edge = np.nonzero(np.abs(distance - radius) < 0.5)
         cover = (radius + 0.5 - distance[edge])[:, None]
-        below = part[edge]
-        cv2.copyTo(drawn, (distance < radius).astype(np.uint8), part)
-        part[edge] = below + cover * (drawn[edge].astype(np.float32) - below)
+        self.image[edge] = self.image[edge] + cover * (np.array(colour, np.float32) - self.image[edge])
 
     def caption(self, left: str, right: str) -> None:
         """Write into both upper corners, on a light strip."""
-        font = max(10, self.pixels // 32)
-        strip = self.image[: 3 * font // 2]
-        strip[:] = cv2.addWeighted(strip, 0.2, np.full_like(strip, 255), 0.8, 0)
-        self.text(left, (font // 2, font // 4), font, INK, 0.0)
-        self.text(right, (self.pixels - font // 2, font // 4), font, INK, 1.0)
+        font = self.font
+        self.strip(0)
+        self.text(left, (font // 2, font // 6), INK, 0.0)
+        self.text(right, (self.pixels - font // 2, font // 6), INK, 1.0)
 
-    def text(self, text: str, at: tuple[int, int], size: int, colour: tuple[int, ...], align: float) -> None:
-        """Write at a column and a row, the top of the line; ``align`` 0: to the right of it, 1: to the left of it."""
-        mask = _text_mask(text, size)
-        column, row = round(at[0] - align * mask.shape[1]), at[1]
+    def legend(self, entries: Sequence[tuple[str, tuple[int, ...]]], muscles: bool) -> None:
+        """Colours and what they mean, on a second strip below that of the caption, if the picture has room for it."""
+        if self.pixels < 20 * self.font:
+            return
+        font, row = self.font, self.strip(1)
+        column = font // 2
+        if muscles:
+            ramp = cv2.resize(MUSCLES[None], (5 * font, font // 2), interpolation=cv2.INTER_LINEAR)
+            column = self.text("expands", (column, row), INK, 0.0) + font // 2
+            self.image[row + font // 3 : row + font // 3 + ramp.shape[0], column : column + ramp.shape[1]] = ramp
+            self.text("contracts", (column + 11 * font // 2, row), INK, 0.0)
+        column = self.pixels - font // 2
+        for name, colour in reversed(entries):
+            column = self.text(name, (column, row), INK, 1.0) - font // 2
+            middle = (column - font // 4, row + 7 * font // 12)
+            cv2.circle(self.image, middle, font // 3, colour, cv2.FILLED, cv2.LINE_AA)
+            column -= 3 * font // 2
+
+    def strip(self, number: int) -> int:
+        """Lighten a line of the picture for text; returns the row where the text begins."""
+        height = 4 * self.font // 3
+        part = self.image[number * height : (number + 1) * height]
+        part[:] = cv2.addWeighted(part, 0.2, np.full_like(part, 255), 0.8, 0)
+        return number * height + self.font // 6
+
+    def text(self, text: str, at: tuple[int, int], colour: tuple[int, ...], align: float) -> int:
+        """Write at a column and a row, the top of the line; ``align`` 0: to the right of it, 1: to the left of it.
+
+        Returns the column at the text's other end.
+        """
+        mask = _text_mask(text, self.font)
+        width = mask.shape[1]
+        column, row = round(at[0] - align * width), at[1]
         mask = mask[: max(0, self.pixels - row), max(0, -column) : max(0, self.pixels - column)]
         part = self.image[row : row + mask.shape[0], max(0, column) : max(0, column) + mask.shape[1]]
         part[:] = mask * np.array(colour) + (1 - mask) * part
+        return column if align else column + width
 
     def _near(self, middle: np.ndarray) -> bool:
         """Whether a figure around here may be seen; OpenCV cannot be given numbers of any size."""
@@ -200,9 +296,11 @@ class Canvas:
 
 @functools.lru_cache(maxsize=512)
 def _text_mask(text: str, size: int) -> np.ndarray:
-    """A line of text, (H, W, 1) from 0 to 1."""
-    font = ImageFont.load_default(size)
+    """A line of text, (H, W, 1) from 0 to 1: drawn larger, because letters of few pixels have whole distances."""
+    large = 4
+    font = ImageFont.load_default(large * size)
     left, _, right, bottom = font.getbbox(text)
-    image = Image.new("L", (int(right - left) + 1, int(bottom) + 1))
+    image = Image.new("L", (int(right - left) + large, int(bottom) + large))
     ImageDraw.Draw(image).text((-left, 0), text, 255, font)
-    return np.asarray(image, np.float32)[..., None] / 255
+    small = image.resize((-(-image.width // large), -(-image.height // large)), Image.Resampling.BOX)
+    return np.asarray(small, np.float32)[..., None] / 255

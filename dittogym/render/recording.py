@@ -19,7 +19,7 @@ from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import SHOWN, replay_page
-from dittogym.render.scene import Scene, Shot, check_view, describe
+from dittogym.render.scene import REST, Scene, Shot, check_view, describe
 from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
@@ -107,6 +107,7 @@ class Recording:
         zoom: float | None = None,
         muscles: bool = True,
         caption: tuple[str, str] | None = None,
+        legend: bool = False,
     ) -> np.ndarray:
         """The picture (size, size, 3) uint8 of a moment; between two steps, particles move on straight lines.
 
@@ -116,6 +117,7 @@ class Recording:
             zoom: As in :meth:`dittogym.TorchEnv.render`.
             muscles: Colour the robot by its muscles.
             caption: What to write into the upper corners.
+            legend: Say below the caption what the colours mean.
         """
         at = float(np.clip(time / self.scene.dt, 0, len(self.shots) - 1))
         before, after = self.shots[int(at)], self.shots[min(int(at) + 1, len(self.shots) - 1)]
@@ -123,7 +125,10 @@ class Recording:
             names = ("x", "origin", "view", "centre")
             moved = {n: (1 - part) * getattr(before, n) + part * getattr(after, n) for n in names}
             before = after._replace(**moved)
-        return frame(self.scene, before, size, zoom, muscles, caption)
+        if "muscle" not in before.values:  # nothing has acted yet, and muscles are at rest
+            rest = np.full(self.scene.bodies[0].count, REST, np.uint8)
+            before = before._replace(values=before.values | {"muscle": rest})
+        return frame(self.scene, before, size, zoom, muscles, caption, legend)
 
     def save(self, path: str | os.PathLike[str], **options: Any) -> Path:
         """Write a film, a filmstrip or a replay, and return its path.
@@ -156,14 +161,15 @@ class Recording:
         return replay_page(self.scene, self.shots, self.rewards, self.success, speed or self.default_speed)
 
     def _frames(self, options: FilmOptions, rate: float) -> Iterator[np.ndarray]:
-        """The pictures of a film with task, time, return and playback speed."""
+        """The pictures of a film with task, time, return, playback speed and the meaning of colours."""
         speed = options.speed or self.default_speed
         returns = np.cumsum([0.0, *self.rewards])
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)
             total = returns[min(round(time / self.scene.dt), len(self.rewards))]
-            caption = f"{self.scene.task}   {self._clock(time)}", f"return {total:.1f}   {pace(speed)}"
-            yield self._picture(time, options, caption)
+            total = f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
+            caption = f"{self.scene.task}   {self._clock(time)}", f"return {total}   {pace(speed)}"
+            yield self._picture(time, options, caption, legend=True)
 
     def _strip(self, options: FilmOptions) -> np.ndarray:
         gap = np.full((options.size, max(1, options.size // 64), 3), 255, np.uint8)
@@ -172,8 +178,9 @@ class Recording:
             strip += [self._picture(time, options, (self._clock(time), "")), gap]
         return np.concatenate(strip[:-1], axis=1)
 
-    def _picture(self, time: float, options: FilmOptions, caption: tuple[str, str]) -> np.ndarray:
-        return self.picture(time, size=options.size, zoom=options.zoom, muscles=options.muscles, caption=caption)
+    def _picture(self, time: float, options: FilmOptions, caption: tuple[str, str], legend: bool = False) -> np.ndarray:
+        size, zoom, muscles = options.size, options.zoom, options.muscles
+        return self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption, legend=legend)
 
     def _clock(self, time: float) -> str:
         """A time in s with so many digits that steps can be told apart."""

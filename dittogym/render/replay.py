@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dittogym.render.scene import VIEW_WIDTH, Scene, Shot
+from dittogym.render.scene import REST, VIEW_WIDTH, Scene, Shot
 
 PLAYER = Path(__file__).parent / "replay.html"
 #: Draws a scene in a browser; :mod:`cfp.play` serves the same file.
@@ -26,8 +26,8 @@ MOST_MOMENTS, MOST_PARTICLES = 400, 3000
 QUANTUM = 2.5e-4
 #: Code of a position that is not finite or too far away.
 NOWHERE = -(2**15)
-#: Values are kept in so many steps of 254.
-VALUE_STEP = 16
+#: Values are kept in steps of so many of 254.
+VALUE_STEP = 8
 
 
 def replay_page(
@@ -64,19 +64,20 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
     chosen, counts = _selection(scene, shots[0])
     arrays = [_positions(kept, chosen)]
     for name, particles in zip(SHOWN, (chosen[: counts[0]], chosen), strict=True):
-        rest = np.full(len(shots[0].x), 127, np.uint8)
+        rest = np.full(len(shots[0].x), REST, np.uint8)
         values = np.stack([shot.values.get(name, rest)[particles] for shot in kept]) // VALUE_STEP
         arrays.append(np.diff(values, axis=0, prepend=np.uint8(0)).tobytes())
     header = scene.as_json() | {
         "quantum": QUANTUM,
         "particles": len(shots[0].x),
+        "levels": 254 // VALUE_STEP,  # the highest value
         "stride": stride,
         "steps": steps,
         "centre": [_rounded(shot.centre) for shot in kept],
         "corner": [_rounded(shot.corner(VIEW_WIDTH)) for shot in kept],
         "width": VIEW_WIDTH,
         "bodies": [
-            {"count": count, "radius": body.radius * math.sqrt(body.count / count), "colour": body.colour}
+            vars(body) | {"count": count, "radius": body.radius * math.sqrt(body.count / count)}
             for body, count in zip(scene.bodies, counts, strict=True)
         ],
     }

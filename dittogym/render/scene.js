@@ -1,10 +1,14 @@
 // The scene of a robot: ground with metres, obstacles, goal and target, and the particles. The page to play on serves
 // this file, and the page of a replay holds it. Its colours are custom properties of the page's style.
 
+// As in `frame.py`: matter is drawn as one piece where nodes of the grid join its particles, in cells of a width, m. A
+// browser has to draw many pictures a second, so they are wider here.
+const BRIDGE = 3 / 128, CELL = 2.5e-3;
+
 export class Scene {
   // ``labels``: the ground has a number at every so many tenths of a metre.
   constructor(canvas, labels = 5) {
-    Object.assign(this, { canvas, labels, context: canvas.getContext("2d"), discs: new Discs() });
+    Object.assign(this, { canvas, labels, context: canvas.getContext("2d"), raster: new Raster() });
     this.style = getComputedStyle(document.documentElement);  // follows changes
     new ResizeObserver(() => { this.resize(); this.redraw?.(); }).observe(canvas);
   }
@@ -52,20 +56,26 @@ export class Scene {
     const { context, canvas, ratio } = this;
     const surface = this.floor === undefined ? canvas.height : this.toPixel(0, this.floor)[1];
     const half = canvas.width / 2 / this.scale, left = this.camera.x - half, right = this.camera.x + half;
+    const tenth = this.scale / 10, inside = canvas.height - surface > 24 * ratio;
     context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textAlign = "center";
-    for (let k = Math.ceil(left * 10); k <= right * 10; k++) {
-      const [column] = this.toPixel(k / 10, 0), major = k % 5 === 0;
+    for (let k = Math.floor(left * 10); k <= right * 10; k++) {
+      const column = Math.round(this.toPixel(k / 10, 0)[0]), next = Math.round(this.toPixel((k + 1) / 10, 0)[0]);
+      context.fillStyle = this.colour("grid");
       if (!labels) {
-        context.fillStyle = this.colour("grid");
-        context.fillRect(Math.round(column), 0, (major ? 2 : 1) * ratio, surface);
-        continue;
+        context.fillRect(column, 0, ratio, surface);
+        context.globalAlpha = 0.3;
+        if (Math.floor(k / 5) % 2) context.fillRect(column, 0, next - column, surface);
+      } else if (k % 2 && inside) {  // every second tenth of a metre of the floor, so that motion along it shows
+        context.fillStyle = "#fff";
+        context.globalAlpha = 0.13;
+        context.fillRect(column, surface, next - column, canvas.height - surface);
       }
-      const inside = canvas.height - surface > 24 * ratio, top = inside ? surface : canvas.height - 22 * ratio;
-      context.fillStyle = this.colour(inside ? "ground-text" : "faint");
-      context.globalAlpha = 0.75;
-      context.fillRect(Math.round(column), top, ratio, (major ? 8 : 4) * ratio);
-      if (k % this.labels === 0) context.fillText(`${(k / 10).toFixed(1)} m`, column, top + 20 * ratio);
+      if (labels && k % this.labels === 0 && column > 18 * ratio && column < canvas.width - 18 * ratio) {
+        context.fillStyle = this.colour(inside ? "ground-text" : "faint");
+        context.globalAlpha = 0.8;
+        context.fillText(`${(k / 10).toFixed(1)} m`, column, inside ? surface + 18 * ratio : canvas.height - 6 * ratio);
+      }
       context.globalAlpha = 1;
     }
   }
@@ -111,28 +121,154 @@ export class Scene {
   }
 
   drawParticles(positions, codes, { robot_only, stops }) {
-    const { task: { bodies }, canvas, discs, ratio } = this, shades = table(stops).map(packed);
-    const outline = packed(this.colour("outline").match(/\w\w/g).map((digits) => parseInt(digits, 16)));
-    discs.begin(canvas.width, canvas.height);
+    const { task: { bodies }, canvas, raster, ratio } = this, scale = table(stops);
+    const outline = this.colour("outline").match(/\w\w/g).map((digits) => parseInt(digits, 16));
+    raster.begin(canvas.width, canvas.height);
     let end = positions.length / 2;
     for (let index = bodies.length - 1; index >= 0; index--) {  // the robot last, on top
-      const body = bodies[index], first = end - body.count, plain = robot_only && index > 0 && packed(body.colour);
-      const radius = Math.max(body.radius * this.scale, 1.2 * ratio), passes = [[radius, plain]];
-      if (body.count <= 3000) passes.unshift([radius + 1.3 * ratio, index && !robot_only ? packed(body.colour) : outline]);
-      for (const [reach, shade] of passes) {
-        for (let i = first; i < end; i++) {
-          const [x, y] = this.toPixel(positions[2 * i], positions[2 * i + 1]);
-          if (x > -reach && x < canvas.width + reach) discs.disc(x, y, reach, shade || shades[codes[i]]);
+      const { count, radius, colour, grains } = bodies[index], first = end - count;
+      const plain = robot_only && index > 0, shades = plain ? scale.map(() => colour) : scale;
+      if (grains && index > 0) {
+        for (const [size, share] of [[1.4, 0.5], [0.6, 1]]) {  // the second time smaller and darker
+          const reach = Math.max(size * radius * this.scale, 1.2 * ratio);
+          const paints = shades.map((shade) => packed(shade.map((value) => share * value + (1 - share) * 255)));
+          for (let i = first; i < end; i++) {
+            const [x, y] = this.toPixel(positions[2 * i], positions[2 * i + 1]);
+            if (x > -reach && x < canvas.width + reach) raster.disc(x, y, reach, paints[Math.round(codes[i])]);
+          }
         }
+      } else {
+        const line = index > 0 && !plain ? colour : outline;
+        this.drawSurface({ positions, codes, first, end }, shades, radius, 1.3 * ratio, line);
       }
       end = first;
     }
-    this.context.drawImage(discs.end(), 0, 0);
+    this.context.drawImage(raster.end(), 0, 0);
+  }
+
+  // A body with a smooth outline of some ``width`` in pixels: the closing of its particles by discs.
+  drawSurface({ positions, codes, first, end }, shades, radius, width, outline) {
+    const { camera, scale, canvas, raster } = this;
+    const reach = Math.max(radius, BRIDGE / 2) / CELL, edge = radius / 2.5 / CELL;  // half a distance of particles
+    const far = [canvas.width, canvas.height].map((pixels) => pixels / 2 / scale + 2 * reach * CELL);
+    const xs = [], ys = [], values = [];  // of what can be seen, in cells
+    for (let i = first; i < end; i++) {
+      const x = positions[2 * i], y = positions[2 * i + 1];
+      if (!(Math.abs(x - camera.x) < far[0] && Math.abs(y - camera.y) < far[1])) continue;  // also where it is not finite
+      xs.push(x / CELL);
+      ys.push(y / CELL);
+      values.push(codes[i]);
+    }
+    if (!xs.length) return;
+    const field = new Field(xs, ys, Math.ceil(reach) + 3), distance = field.distances(xs, ys);
+    const near = Float32Array.from(field.nearest, (i) => values[i] ?? 0);
+    field.blur(near);
+    field.blur(near);
+    // Below the surface, pixels: from the distance to the rim of the cells that the discs cover.
+    const rim = field.rim(distance, reach), depth = field.distances(rim.xs, rim.ys);
+    for (let k = 0; k < depth.length; k++) {
+      const inside = distance[k] < reach ? depth[k] - rim.beyond[field.nearest[k]] : reach - distance[k];
+      depth[k] = (inside - reach + edge) * CELL * scale;
+    }
+    const paints = shades.map(packed), step = 1 / scale / CELL;
+    const x0 = ((0.5 - canvas.width / 2) / scale + camera.x) / CELL - field.left;
+    const y0 = ((canvas.height / 2 - 0.5) / scale + camera.y) / CELL - field.bottom;
+    const clip = (pixel, high) => Math.min(Math.max(Math.ceil(pixel), 0), high);
+    const left = clip(-x0 / step, canvas.width), right = clip((field.columns - 1.001 - x0) / step, canvas.width);
+    const top = clip((y0 - field.rows + 1.001) / step, canvas.height), bottom = clip(y0 / step, canvas.height);
+    for (let row = top; row < bottom; row++) {
+      const y = y0 - row * step, j = Math.floor(y), v = y - j;
+      for (let column = left; column < right; column++) {
+        const x = x0 + column * step, i = Math.floor(x), u = x - i, k = j * field.columns + i, above = k + field.columns;
+        const mix = (of) => (1 - v) * ((1 - u) * of[k] + u * of[k + 1]) + v * ((1 - u) * of[above] + u * of[above + 1]);
+        const pixels = mix(depth);
+        if (!(pixels > -0.5)) continue;
+        const code = Math.round(mix(near)), at = row * canvas.width + column;
+        if (pixels > width + 0.5) {
+          raster.pixels[at] = paints[code];
+        } else {
+          const line = 0.75 * Math.min(width + 0.5 - pixels, 1);
+          const shade = shades[code].map((value, channel) => value + line * (outline[channel] - value));
+          raster.cover(at, shade, Math.min(pixels + 0.5, 1));
+        }
+      }
+    }
   }
 }
 
-// Discs drawn into an image by hand, which is several times faster than a canvas where there is no GPU.
-class Discs {
+// Cells around some points, in which distances are measured; points are given in units of their width.
+class Field {
+  constructor(xs, ys, border) {
+    const lowest = (values) => Math.floor(values.reduce((low, value) => Math.min(low, value))) - border;
+    const highest = (values) => Math.ceil(values.reduce((high, value) => Math.max(high, value))) + border;
+    Object.assign(this, { left: lowest(xs), bottom: lowest(ys) });  // the middle of the first cell
+    Object.assign(this, { columns: highest(xs) - this.left + 1, rows: highest(ys) - this.bottom + 1 });
+    this.nearest = new Int32Array(this.columns * this.rows);
+  }
+
+  // From each cell to the nearest point, which is noted; cells pass on to their neighbours what they have found. Cells at
+  // the border stay at infinity.
+  distances(xs, ys) {
+    const { nearest, columns, rows, left, bottom } = this, squares = new Float32Array(nearest.length).fill(Infinity);
+    const square = (point, column, row) => (xs[point] - left - column) ** 2 + (ys[point] - bottom - row) ** 2;
+    nearest.fill(-1);
+    for (let i = 0; i < xs.length; i++) {
+      const column = Math.round(xs[i]) - left, row = Math.round(ys[i]) - bottom;
+      const k = row * columns + column, found = square(i, column, row);
+      if (found < squares[k]) squares[k] = found, nearest[k] = i;
+    }
+    const update = (column, row, neighbours) => {
+      const k = row * columns + column;
+      for (let n = 0; n < neighbours.length; n++) {
+        const point = nearest[k + neighbours[n]];
+        if (point < 0) continue;
+        const found = square(point, column, row);
+        if (found < squares[k]) squares[k] = found, nearest[k] = point;
+      }
+    };
+    for (const way of [1, -1]) {
+      const before = -way * columns, along = [before - 1, before, before + 1, -1], back = [1];
+      for (let row = way > 0 ? 1 : rows - 2; row > 0 && row < rows - 1; row += way) {
+        for (let column = 1; column < columns - 1; column++) update(column, row, along);
+        for (let column = columns - 2; column > 0; column--) update(column, row, back);
+      }
+    }
+    return squares.map(Math.sqrt);
+  }
+
+  // The cells from ``reach`` on that touch nearer ones, and how far they lie beyond it.
+  rim(distance, reach) {
+    const { columns, rows } = this, found = { xs: [], ys: [], beyond: [] };
+    for (let row = 1; row < rows - 1; row++) {
+      for (let column = 1; column < columns - 1; column++) {
+        const k = row * columns + column;
+        const around = [k - 1, k + 1, k - columns, k + columns];
+        if (distance[k] < reach || !around.some((other) => distance[other] < reach)) continue;
+        found.xs.push(this.left + column);
+        found.ys.push(this.bottom + row);
+        found.beyond.push(distance[k] - reach);
+      }
+    }
+    return found;
+  }
+
+  // Means over squares of 5 by 5 cells, in place.
+  blur(values) {
+    const { columns, rows } = this;
+    for (const [count, step, lines, next] of [[columns, 1, rows, columns], [rows, columns, columns, 1]]) {
+      const line = new Float32Array(count);
+      for (let start = 0; start < lines * next; start += next) {
+        for (let i = 0; i < count; i++) line[i] = values[start + i * step];
+        for (let i = 2; i < count - 2; i++) {
+          values[start + i * step] = (line[i - 2] + line[i - 1] + line[i] + line[i + 1] + line[i + 2]) / 5;
+        }
+      }
+    }
+  }
+}
+
+// Pixels written by hand, which is several times faster than a canvas where there is no GPU.
+class Raster {
   constructor() {
     this.canvas = new OffscreenCanvas(1, 1);
     this.context = this.canvas.getContext("2d");
@@ -147,23 +283,24 @@ class Discs {
     this.pixels.fill(0);
   }
 
-  // ``colour`` as from `packed`; its outer edge is smooth where nothing has been drawn before.
+  // Paint a share of a pixel.
+  cover(k, [red, green, blue], share) {
+    const { data } = this.image, below = data[4 * k + 3] / 255 * (1 - share), alpha = share + below;
+    data[4 * k] = (share * red + below * data[4 * k]) / alpha;
+    data[4 * k + 1] = (share * green + below * data[4 * k + 1]) / alpha;
+    data[4 * k + 2] = (share * blue + below * data[4 * k + 2]) / alpha;
+    data[4 * k + 3] = 255 * alpha;
+  }
+
+  // ``colour`` as from `packed`.
   disc(x, y, radius, colour) {
     const { pixels, image: { width, height } } = this;
     const bottom = Math.min(height - 1, Math.floor(y + radius));
     for (let row = Math.max(0, Math.ceil(y - radius)); row <= bottom; row++) {
       const half = Math.sqrt(radius * radius - (row - y) * (row - y)), base = row * width;
-      const left = Math.max(x - half, 0), right = Math.min(x + half, width - 1);
-      const from = Math.ceil(left), to = Math.floor(right);
+      const from = Math.ceil(Math.max(x - half, 0)), to = Math.floor(Math.min(x + half, width - 1));
       for (let k = base + from; k <= base + to; k++) pixels[k] = colour;
-      if (from > 0 && from <= to) this.edge(base + from - 1, from - left, colour);
-      if (to < width - 1 && from <= to) this.edge(base + to + 1, right - to, colour);
     }
-  }
-
-  edge(k, cover, colour) {
-    const alpha = Math.round(255 * cover);
-    if (this.pixels[k] >>> 24 < alpha) this.pixels[k] = (colour & 0xffffff | alpha << 24) >>> 0;
   }
 
   end() {

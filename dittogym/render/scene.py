@@ -62,6 +62,8 @@ SCALES = {
     ),
     "speed": ColourScale("speed, m/s", 0.0, 1.5, ((49, 54, 110), (78, 121, 190), (120, 200, 190), (253, 231, 130))),
 }
+#: Code of muscles at rest.
+REST = 127
 #: Names of all quantities of particles.
 QUANTITIES = tuple(SCALES)
 #: Radius of a particle by the distance between particles, which closes even a body of random positions; of a grain.
@@ -81,6 +83,7 @@ class Matter:
     count: int
     radius: float  # m
     colour: Colour
+    grains: bool  # loose, not one surface
 
 
 class Solid(NamedTuple):
@@ -161,7 +164,7 @@ def describe(model: Model) -> Scene:
         grains = isinstance(body.material, Snow)
         radius = GRAIN_RADIUS if grains else RADIUS
         colour = ROBOT if body is spec.robot else GROUND_BODY if grains else OBJECT
-        matter.append(Matter(count, radius * math.sqrt(body.shape.area / count), colour))
+        matter.append(Matter(count, radius * math.sqrt(body.shape.area / count), colour, grains))
     solids = tuple(
         Solid(box.left, box.right, box.bottom, box.top, bool(obstacle.observed_boxes) or box == Box(top=box.top))
         for obstacle in spec.obstacles

@@ -94,7 +94,7 @@ def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     assert lines[0] == "## shapematch"
     assert [line.split(" | ")[:3] for line in lines[6:]] == [
         ["| 1", "my-policy", "image"],
-        ["| 1", "zero", "nothing"],
+        ["| reference", "zero", "nothing"],
     ]
 
 
@@ -155,12 +155,15 @@ def test_ranks_are_by_mean_return_within_what_is_observed():
             scored("as good", 5.0),
             scored("planner", 99.0, sees="simulator"),
             scored("bad", -7.0),
-            scored("zero", 1.0, sees="nothing", task="kick"),
+            scored("zero", 7.0, sees="nothing", sha256=None),
+            scored("open loop", 1.0, sees="nothing"),
+            scored("zero", 1.0, sees="nothing", sha256=None, task="kick"),
         ]
     )
     ranks = [(row["rank"], row["policy"]) for row in run.rows]
-    assert ranks == [(1, "best"), (2, "good"), (2, "as good"), (4, "bad"), (1, "planner")]
-    assert (run.name, kick.name) == ("run", "kick") and [row["rank"] for row in kick.rows] == [1]
+    ranked = [(1, "best"), (2, "good"), (2, "as good"), (4, "bad"), (1, "planner"), (1, "open loop")]
+    assert ranks == [*ranked, ("reference", "zero")]
+    assert (run.name, kick.name) == ("run", "kick") and [row["rank"] for row in kick.rows] == ["reference"]
 
 
 def test_committed_results_are_those_of_the_package():

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dittogym import BatchEnv, Env, TorchEnv, make_spec
-from dittogym.render.frame import GROUND, SOLID, TARGET, Canvas
-from dittogym.render.scene import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, describe, shear_strain, speed
+from dittogym.render.frame import BRIDGE, GROUND, SOLID, TARGET, TILE, Canvas, frame
+from dittogym.render.scene import CONTRACT, EXPAND, OBJECT, RELAX, ROBOT, SCALES, Solid, describe, shear_strain, speed
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -26,7 +26,7 @@ def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
     assert 0.85 * area < len(rows) < 1.15 * area
     assert columns.mean() == pytest.approx(0.4 * 512, abs=3)
     assert rows.mean() == pytest.approx((1 - 0.25) * 512, abs=3)
-    ground = near(image, SOLID)[0]
+    ground = np.concatenate([near(image, shade)[0] for shade in (SOLID, TILE)])  # every tenth of a metre another
     assert ground.max() == 511 and (ground > (1 - 20 / 128) * 512 - 2).mean() > 0.9
 
 
@@ -80,6 +80,14 @@ def test_a_robot_that_has_flown_far_away(task: str) -> None:
     assert not len(near(env.render(), ROBOT)[0])
 
 
+def test_matter_that_lies_far_apart() -> None:
+    """Two pieces in a picture of twenty metres."""
+    canvas = Canvas(256, np.zeros(2), 20.0)
+    canvas.surface(np.array(((1.0, 1.0), (19.0, 19.0))), np.array(ROBOT, np.uint8), 0.2, 0.2, 0)
+    assert all(tuple(canvas.image[row, column]) == ROBOT for row, column in ((243, 12), (12, 243)))
+    assert tuple(canvas.image[128, 128]) == GROUND
+
+
 def test_particles_that_are_not_finite_are_left_out() -> None:
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)
@@ -97,6 +105,36 @@ def test_holes_of_a_target_stay_empty() -> None:
     canvas.target(describe(TorchEnv(spec, particles=100).model).target, np.array((0.5, 0.5)))
     for distance, colour in ((0, TARGET), (24, GROUND), (44, TARGET), (62, GROUND)):  # pixels of the picture
         assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])
+
+
+@pytest.mark.parametrize(("nodes", "joined"), [(2.5, True), (3.5, False)])
+def test_matter_is_one_piece_as_far_as_its_particles_share_nodes(nodes: float, joined: bool) -> None:
+    """Two ribs of a body beside each other; a particle that is not finite changes nothing."""
+    canvas, height = Canvas(512, np.zeros(2)), np.arange(0.4, 0.6, 0.002)
+    ribs = [np.stack((np.full_like(height, 0.5 + side * nodes / 128 / 2), height), 1) for side in (-1, 1)]
+    canvas.surface(np.concatenate([*ribs, [[np.nan, 0.5]]]), np.array(ROBOT, np.uint8), BRIDGE / 2, 0.001, 0)
+    assert tuple(canvas.image[256, 256]) == (ROBOT if joined else GROUND)
+    assert tuple(canvas.image[256, 256 - 20]) == tuple(canvas.image[256, 256 + 20]) == GROUND
+
+
+def test_the_floor_moves_past_a_camera_that_follows() -> None:
+    floor = Solid(-np.inf, np.inf, -np.inf, 0.1, True)
+    for left in (0.0, 0.1, 2.3):
+        canvas = Canvas(200, np.array((left, 0.0)))
+        canvas.box(floor)
+        shades = [tuple(canvas.image[190, column]) for column in (10, 30, 50)]
+        assert shades == ([SOLID, TILE, SOLID] if round(10 * left) % 2 == 0 else [TILE, SOLID, TILE])
+
+
+@pytest.mark.parametrize(("task", "colours"), [("run", ()), ("grow", (TARGET,)), ("kick", (OBJECT,))])
+def test_a_legend_shows_the_colours_of_the_scene(task: str, colours) -> None:
+    env = TorchEnv(task, 1, particles=100)
+    env.reset(seed=0)
+    scene, shot = describe(env.model), env.shot()
+    top = frame(scene, shot, 360, legend=True)[17:34]
+    others = {TARGET, OBJECT} - set(colours)
+    assert all(len(near(top, colour)[0]) > 9 for colour in (EXPAND, CONTRACT, *colours))
+    assert not any(len(near(top, colour)[0]) for colour in others)
 
 
 @pytest.mark.parametrize("muscles", [True, False])
