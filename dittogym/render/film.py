@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,8 +15,6 @@ from PIL import Image
 from dittogym.files import replacing
 
 Frame = TypeVar("Frame")
-#: What an error says when the ffmpeg that imageio has found is of no use; ffmpeg itself prints why.
-FAILED = "MP4 cannot be written: ffmpeg, which needs libx264, has failed"
 #: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.
 UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
 
@@ -78,10 +76,17 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     writer: Any = imageio.get_writer(path, format="FFMPEG", fps=rate, **options)
     with closing(writer):  # its own `with` leaves ffmpeg running where there is an error
         for frame in _held(frames, round(rate)):
-            try:
+            with _named_failure():
                 writer.append_data(frame)
-            except (OSError, RuntimeError) as error:
-                reason = str(error).partition("\n")[0]  # a page follows
-                raise VideoUnavailable(f"{FAILED} ({reason})") from error
-    if not path.stat().st_size:  # ffmpeg took all of a short film before it failed
-        raise VideoUnavailable(FAILED)
+    # It may have failed after the last picture, such as on a full disk, of which the writer tells nothing.
+    with _named_failure():
+        imageio.get_reader(path, format="FFMPEG").close()
+
+
+@contextmanager
+def _named_failure() -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = str(error).partition("\n")[0]  # a page follows
+        raise VideoUnavailable(f"MP4 cannot be written: ffmpeg, which needs libx264, has failed ({reason})") from error
