@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, get_args
 
+import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -214,8 +215,9 @@ def write_report(folder: Path, results: Sequence[Result], first: str, protocol: 
         state = state.replace(":", "; the others:")
     lines = [f"{each.run.name}: {each.state}{f' ({each.run.error})' if each.run.error else ''}" for each in others]
     write_text(folder / "episodes.csv", csv_text(raw_rows(results), RAW), shared=True)
-    write_figure(folder / "returns.png", draw(results), shared=True)
-    write_figure(folder / "returns-narrow.png", draw(results, columns=1), shared=True)
+    with matplotlib.style.context("default"):  # not the user's own, which may need LaTeX
+        write_figure(folder / "returns.png", draw(results), shared=True)
+        write_figure(folder / "returns-narrow.png", draw(results, columns=1), shared=True)
     parts = ["# Comparison", state, "\n".join(f"- {line}" for line in lines), table.to_markdown()]
     text = "\n\n".join(part for part in [*parts, "![Learning curves and returns](returns.png)"] if part) + "\n"
     write_text(folder / "report.md", text, shared=True)
