@@ -135,7 +135,7 @@ def test_the_window_on_the_screen_shows_the_picture(pygame) -> None:
     env.reset(seed=0)
     for _ in range(2):
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
-        assert np.array_equal(shown[30:], env.unwrapped.torch_env.render()[30:])  # below the caption
+        assert np.array_equal(shown[50:], env.unwrapped.torch_env.render()[50:])  # below caption and legend
         env.step(np.ones((2, 8, 8), np.float32))
     assert pygame.display.get_caption()[0] == "dittogym: run" and env.unwrapped.window_open
     env.close()
