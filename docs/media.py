@@ -35,6 +35,7 @@ SECONDS, RATE = 6.0, 10
 #: Of the moments beside each other: the policy, their number, what each shows of the world, m, and its pixels.
 HERO, MOMENTS = "obstacle", 4
 LEFT, RIGHT, BOTTOM, TOP = -0.08, 0.80, 0.10, 0.45
+LAST = 0.63  # where the robot's centre is at the last moment, m
 WIDE = 320
 
 
@@ -73,7 +74,7 @@ def moments(recording: Recording) -> np.ndarray:
     below = Canvas(side, np.zeros(2))
     below.font, below.image[:] = 20, 255
     pictures = []
-    for number, place in enumerate(np.linspace(places[0], places.max(), MOMENTS)):
+    for number, place in enumerate(np.linspace(places[0], LAST, MOMENTS)):
         step = int(np.argmax(places >= place - 1e-6))
         there = {"origin": np.array((LEFT, 0.0)), "view": np.full(2, span / 2)}
         still = replace(recording, shots=[recording.shots[step]._replace(**there)])
