@@ -177,7 +177,7 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     policy, spec = policies[file.stem], config.make_spec()
     name = given if is_address(given) else file.resolve().parent.name if file.stem == "policy" else file.stem
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
-    few: list[tuple[str, Tier, int]] = [(UNDISTURBED, "lite", command.disturbed), (UNDISTURBED, "full", command.full)]
+    lite: tuple[str, Tier, int] = (UNDISTURBED, "lite", command.disturbed)
     every: list[tuple[str, Tier, int]] = [
         (UNDISTURBED, "lite", command.episodes),
         *((case, "lite", command.disturbed) for case in choose(effective(spec, policy.uses_image), command.cases)),
@@ -187,7 +187,8 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     zero = partial(Evaluation, config, UntrainedPolicy("zero", spec.coarse), "zero", "", True)
     random = partial(Evaluation, config, UntrainedPolicy("random", spec.coarse), "random", "", False)
     own = partial(Evaluation, config, policy, name, sha256, without_noise(policy, command.noise))
-    found = [*(make(*case) for make in (zero, random) for case in few), *(own(*case) for case in every)]
+    others = [zero(*lite), random(*lite), zero(UNDISTURBED, "full", command.full)]
+    found = [*others, *(own(*case) for case in every)]
     return sorted((each for each in found if each.episodes), key=lambda each: each.particles == "full")
 
 

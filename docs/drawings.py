@@ -12,11 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from tables import DOCS, constants, evaluation, geometry, name_of, read
+from tables import DOCS, constants, evaluated, geometry, name_of, read
 
 import cfp
 import dittogym
 from baselines.compare import paper
+from cfp.robustness import OWN_START, UNDISTURBED
 from dittogym.action import patch_field, place, to_grid_layout
 
 IMAGES = DOCS / "images"
@@ -31,7 +32,7 @@ matplotlib.rcParams["font.size"] = 9
 def source(name: str) -> str:
     """Hash of the data that a picture shows, which is stored in its file: a test compares them."""
     if name == "returns.svg":
-        data = "".join((DOCS / f"{table}.csv").read_text() for table in ("policies", "training"))
+        data = "".join((DOCS / f"{table}.csv").read_text() for table in ("evaluations", "training"))
     elif name.startswith("tasks/"):
         data = geometry(Path(name).stem) + constants(Path(name).stem)
     else:
@@ -177,12 +178,13 @@ def draw_scene(task: str) -> None:
 
 def normalised(task: str, name: str, key: str) -> float:
     """A number of an evaluation on a scale where the paper's resting robot has 0 and its CFP 1."""
-    return paper.normalised(task, float(evaluation(task, name)[key]))
+    case = (UNDISTURBED, "lite") if name in ("zero", "random") else (OWN_START, "full")
+    return paper.normalised(task, float(evaluated(task, name, *case)[key]))
 
 
 def draw_returns() -> None:
     """The normalised returns of all tasks, from the lowest to the highest episode."""
-    tasks = [row["task"] for row in read("training.csv")][::-1]
+    tasks = [row["task"] for row in read("training.csv") if row["policy"] == row["task"]][::-1]
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     axes = figure.subplots()
     axes.axvline(0, color="0.8", zorder=0)

@@ -17,7 +17,7 @@ from typing import Any
 
 import dittogym
 from baselines.compare import paper
-from cfp.robustness import COLUMNS, DISTURBANCES, MATTER, OWN_START, UNDISTURBED, ratios
+from cfp.robustness import COLUMNS, DISTURBANCES, KEY, MATTER, OWN_START, UNDISTURBED, ratios
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Box, Obstacle
 from dittogym.spec import BodySpec
@@ -66,21 +66,11 @@ def name_of(task: str) -> str:
 # Results
 
 
-def policies() -> list[Row]:
-    """Rows of `policies.csv` in the form of `returns.csv`: zero and random actions, and trained policies."""
-    rows, shipped = [], {path.stem for path in (ROOT / "cfp/pretrained").glob("*.safetensors")}
-    for row in read("policies.csv"):
-        name = row["policy"]
-        observes = "nothing" if name in ("zero", "random") else "image"
-        label = f"{name} actions" if observes == "nothing" else f'`cfp.load("{name}")`' if name in shipped else name
-        rows.append(row | {"algorithm": label, "observes": observes, "name": name})
-    return rows
-
-
-def evaluation(task: str, name: str) -> Row:
-    """The evaluation with full particles of a task's own policy, or of `zero` or `random`, with the most episodes."""
-    found = [row for row in policies() if (row["task"], row["name"], row["particles"]) == (task, name, "full")]
-    return max(found, key=lambda row: int(row["episodes"]))
+def evaluated(task: str, policy: str, case: str, particles: str, noise: str = "") -> Row:
+    """The row of an evaluation by `torchmpm robustness`, with empty cells if there is none."""
+    key = task, policy, case, particles
+    rows = (row for row in read("evaluations.csv") if tuple(row[name] for name in KEY[1:5]) == key)
+    return next((row for row in rows if noise in ("", row["noise"])), dict.fromkeys(COLUMNS, ""))
 
 
 def spread(row: Row) -> str:
@@ -90,39 +80,43 @@ def spread(row: Row) -> str:
     return f" ± {number(row['std'])}" if float(row.get("std") or 0) else ""
 
 
-def success(row: Row) -> str:
-    """Share of successful episodes."""
-    count, _, total = (row.get("success") or "").partition(" of ")
-    return f"{float(count) / float(total or 1):.0%}" if count else ""
+def estimate(row: Row) -> str:
+    """Mean return with half its 95 % interval."""
+    return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
 
 
-def exceeds(row: Row, value: float) -> bool:
-    """Whether the lower end of the 95 % interval of a mean, or else the lowest episode, is above a value."""
-    if not row["std"]:
-        return float(row["lowest"]) > value
-    return float(row["mean"]) - 1.96 * float(row["std"]) / int(row["episodes"]) ** 0.5 > value
+def compared(row: Row, theirs: int) -> str:
+    """The same, bold if the lower end of the interval is above the paper's return."""
+    above = row["interval"] and float(row["mean"]) - float(row["interval"]) > theirs
+    return f"**{estimate(row)}**" if above else estimate(row)
+
+
+def share(text: str) -> str:
+    """A share in percent."""
+    return f"{float(text):.0%}" if text else "–"
 
 
 def results() -> str:
-    """All tasks: zero and random actions, the policy of the package, and the paper's."""
+    """All tasks: zero and random actions, the policies of the package, and the paper's."""
     rows = []
     for training in read("training.csv"):
-        task = training["task"]
-        ours, (theirs, _) = evaluation(task, task), paper.CURVES[task][0]
-        mean = number(ours["mean"])
+        task, policy = training["task"], training["policy"]
+        full, lite = evaluated(task, policy, OWN_START, "full"), evaluated(task, policy, UNDISTURBED, "lite")
+        theirs = paper.CURVES[task][0][0]
         rows.append(
             [
-                name_of(task),
-                *(number(evaluation(task, name)["mean"]) for name in ("zero", "random")),
-                f"**{mean}**" if exceeds(ours, theirs) else mean,
-                success(ours),
+                name_of(task) + (f", `{policy}`" if policy != task else ""),
+                number(evaluated(task, "zero", UNDISTURBED, "lite")["mean"]),
                 f"{theirs:,}",
+                compared(full, theirs),
+                share(full["success"]),
+                estimate(lite),
+                share(lite["success"]),
                 training["minutes"],
-                f"{number(training['steps'])} / {paper.STEPS[task]:,}",
             ]
         )
-    names = ("zero actions", "random actions", "this package", "success", "paper's CFP", "minutes on one core")
-    return markdown(("", *names, "steps, here / in the paper"), rows)
+    own = "own start, full: return", "success", "varied starts, lite: return", "success"
+    return markdown(("", "zero actions", "paper's CFP", *own, "minutes on one core"), rows)
 
 
 #: Cases of the protocol behind each of the six ratios.
@@ -136,20 +130,12 @@ RATIOS = {
 }
 
 
-def evaluations(name: str = "evaluations.csv") -> str:
+def evaluations() -> str:
     """What `torchmpm robustness` has measured of each policy, with ratios (and plain quotients); the paper's CFP."""
-    rows = read(name)
-
-    def found(task: str, policy: str, case: str, particles: str, noise: str = "") -> Row:
-        key = task, policy, case, particles
-        fits = (row for row in rows if (row["task"], row["policy"], row["case"], row["particles"]) == key)
-        return next((row for row in fits if noise in ("", row["noise"])), dict.fromkeys(COLUMNS, ""))
-
-    def mean(row: Row) -> str:
-        return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
+    rows = read("evaluations.csv")
 
     def pair(first: Row, second: Row, column: str) -> str:
-        return " / ".join(f"{float(row[column]):.0%}" if row[column] else "–" for row in (first, second))
+        return f"{share(first[column])} / {share(second[column])}"
 
     def ratio(cases: Sequence[Row]) -> str:
         """The lowest ratio of some cases, and its quotient."""
@@ -157,27 +143,30 @@ def evaluations(name: str = "evaluations.csv") -> str:
         return "{:.2f} ({:.2f})".format(*min(pairs)) if pairs else ""
 
     lines = []
-    for task, policy, noise in dict.fromkeys((r["task"], r["policy"], r["noise"]) for r in rows if r["sha256"]):
+    found = dict.fromkeys((row["task"], row["policy"], row["noise"]) for row in rows if row["sha256"])
+    for task, policy, noise in sorted(found, key=lambda key: [*dittogym.TASKS].index(key[0])):
         lite, full, own = (
-            found(task, policy, *case, noise)
+            evaluated(task, policy, *case, noise)
             for case in ((UNDISTURBED, "lite"), (UNDISTURBED, "full"), (OWN_START, "full"))
         )
-        theirs = paper.CURVES[task][0][0] if task in paper.CURVES else None
-        better = theirs is not None and own["interval"] and float(own["mean"]) - float(own["interval"]) > theirs
+        theirs = paper.CURVES[task][0][0]
         lines.append(
             [
-                name_of(task) if task in dittogym.TASKS else task,
+                name_of(task),
                 f"`{policy}`" + ", mean action" * (noise == "without"),
-                *(mean(found(task, kind, UNDISTURBED, "lite")) for kind in ("zero", "random")),
-                *(mean(row) for row in (lite, full)),
-                f"**{mean(own)}**" if better else mean(own),
-                f"{theirs:,}" if theirs else "",
+                *(estimate(evaluated(task, kind, UNDISTURBED, "lite")) for kind in ("zero", "random")),
+                *(estimate(row) for row in (lite, full)),
+                compared(own, theirs),
+                f"{theirs:,}",
                 pair(lite, full, "success"),
                 pair(lite, full, "success_whole"),
                 pair(lite, full, "piece"),
                 *(
                     ratio(
-                        [found(task, policy, case, "full" if case == UNDISTURBED else "lite", noise) for case in cases]
+                        [
+                            evaluated(task, policy, case, "full" if case == UNDISTURBED else "lite", noise)
+                            for case in cases
+                        ]
                     )
                     for cases in RATIOS.values()
                 ),
@@ -208,10 +197,16 @@ def planning() -> str:
     )
 
 
+def shipped() -> list[Row]:
+    """Rows of `evaluations.csv` about the task's own starts, in the form of `returns.csv`."""
+    own = (row for row in read("evaluations.csv") if row["case"] == OWN_START)
+    return [row | {"algorithm": f'`cfp.load("{row["policy"]}")`', "observes": "image"} for row in own]
+
+
 def returns() -> str:
     """Mean returns of all algorithms in all tasks with full particles, from the evaluations with the most episodes."""
     cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
-    for row in (*policies(), *read("returns.csv")):
+    for row in (*shipped(), *read("returns.csv")):
         label = re.sub(r" --learning-rate.*`|, .*", "`", row["algorithm"]).replace(f'("{row["task"]}")', "(task)")
         label = "`distill`" if "distill" in row["algorithm"] else label.replace("``", "`").strip()
         if row["particles"] == "full" and "target" not in row["algorithm"]:
@@ -348,12 +343,6 @@ def cuda_kernels() -> str:
     return markdown(list(rows[0]), (list(row.values()) for row in rows))
 
 
-def from_csv(name: str) -> str:
-    """A CSV file as it is."""
-    rows = read(name)
-    return markdown(list(rows[0]), (list(row.values()) for row in rows))
-
-
 def verification() -> str:
     """Errors of the solver, with a row for each problem."""
     problems: dict[str, list[Row]] = {}
@@ -479,7 +468,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "best-rewards": best_rewards,
     "constants": constants,
     "costs": costs,
-    "csv": from_csv,
     "cuda-kernels": cuda_kernels,
     "evaluations": evaluations,
     "geometry": geometry,

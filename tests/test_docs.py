@@ -24,7 +24,7 @@ def test_tables_are_current(page):
     assert page.read_text() == tables.refreshed(page.read_text()), "python docs/tables.py writes the tables anew"
 
 
-def test_table_of_evaluations_is_made_of_the_rows_that_exist(tmp_path):
+def test_table_of_evaluations_is_made_of_the_rows_that_exist(tmp_path, monkeypatch):
     def row(policy, case, mean, particles="lite", noise="with", success="0.5"):
         about = {"protocol": "v2", "task": "run", "policy": policy, "case": case, "particles": particles}
         measured = {"noise": noise, "mean": mean, "interval": "100.4", "success": success, "sha256": "a"}
@@ -38,11 +38,12 @@ def test_table_of_evaluations_is_made_of_the_rows_that_exist(tmp_path):
         row("mine", "own start", "9000.0", "full", success="1.0"),
         row("mine", "undisturbed", "3000.0", noise="without"),
     ]
-    with (tmp_path / "rows.csv").open("w") as file:
+    monkeypatch.setattr(tables, "DOCS", tmp_path)
+    with (tmp_path / "evaluations.csv").open("w") as file:
         writer = csv.DictWriter(file, tables.COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    head, _, *lines = tables.evaluations(str(tmp_path / "rows.csv")).splitlines()
+    head, _, *lines = tables.evaluations().splitlines()
     noisy, quiet = (dict(zip(head.split(" | "), line.split(" | "), strict=True)) for line in lines)
     assert noisy["policy"] == "`mine`" and quiet["policy"] == "`mine`, mean action"
     assert noisy["zero actions"] == "2,000 ± 100" and noisy["random actions"] == noisy["full"] == ""

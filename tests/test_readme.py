@@ -39,10 +39,9 @@ def run(source: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 PAGES = {
     "README.md": (
-        "assert muscles.grad.abs().max() > 0",
+        "import os\nassert os.path.getsize('grow.html') > 100_000",
         "assert env.observation_space.shape == (3, 64, 64)",
         "assert reward.shape == (16,) and actions.grad.flatten(1).norm(dim=1).min() > 0",
-        "assert action.shape == env.action_space.shape and action.any()",
     ),
     "docs/start.md": (
         "import os\nassert os.path.getsize('moving.html') > 100_000",
