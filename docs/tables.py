@@ -102,7 +102,7 @@ def results() -> str:
     for training in read("training.csv"):
         task, policy = training["task"], training["policy"]
         full, lite = evaluated(task, policy, OWN_START, "full"), evaluated(task, policy, UNDISTURBED, "lite")
-        theirs = paper.CURVES[task][0][0]
+        theirs, several = paper.CURVES[task][0][0], int(training["seeds"]) > 1
         rows.append(
             [
                 name_of(task) + (f", `{policy}`" if policy != task else ""),
@@ -113,10 +113,11 @@ def results() -> str:
                 estimate(lite),
                 share(lite["success"]),
                 training["minutes"],
+                training["seeds"] + f": {number(training['lowest'])} to {number(training['highest'])}" * several,
             ]
         )
     own = "own start, full: return", "success", "varied starts, lite: return", "success"
-    return markdown(("", "zero actions", "paper's CFP", *own, "minutes on one core"), rows)
+    return markdown(("", "zero actions", "paper's CFP", *own, "minutes on one core", "trainings"), rows)
 
 
 #: Cases of the protocol behind each of the six ratios.
