@@ -153,13 +153,13 @@ class Trial:
     episodes: int
     deterministic: bool
     seed: int
-    batch: int = 1  # episodes in one environment; more only on devices that are faster that way
+    together: bool = False  # all episodes in one environment, on devices that are faster that way; or each in its own
 
     def spans(self) -> list[tuple[int, int]]:
         """First layout and number of layouts of each environment."""
-        return [
-            (self.seed + first, min(self.batch, self.episodes - first)) for first in range(0, self.episodes, self.batch)
-        ]
+        if self.together:
+            return [(self.seed, self.episodes)]
+        return [(self.seed + k, 1) for k in range(self.episodes)]
 
     def play(self, first: int, count: int, before_step: Callable[[], None]) -> list[Played]:
         """Play the episodes of a span, that of the first layout first."""
@@ -219,7 +219,7 @@ def make_trial(
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
-        batch=1 if torch.device(choose_device(config.device)).type == "cpu" else episodes,
+        together=torch.device(choose_device(config.device)).type != "cpu",
     )
 
 
@@ -243,7 +243,8 @@ def play(
     """
     spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
-    workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
+    # On a GPU one at a time: nobody may draw random numbers while an environment records its operations.
+    workers = 1 if any(trial.together for trial in trials) else min(threads, len(spans))
     total = (steps or 0) * sum(trial.episodes for trial in trials)
     # Beside the bar of a training (leave=None) it vanishes at the end.
     bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))

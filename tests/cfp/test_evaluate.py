@@ -1,6 +1,7 @@
 """Evaluations: the same digits however episodes are spread over threads, and what may be chosen for them."""
 
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -49,11 +50,11 @@ def tiny(task="run", **environment):
     return replace(config, device="cpu", **options)
 
 
-def fake_trial(policy, episodes, batch=1, **options):
+def fake_trial(policy, episodes, together=False, **options):
     def make_env(count):
         return Layouts(count, **{"horizon": 4} | options)
 
-    return Trial("", 8, policy, make_env, episodes, deterministic=False, seed=0, batch=batch)
+    return Trial("", 8, policy, make_env, episodes, deterministic=False, seed=0, together=together)
 
 
 class Layouts(FakeEnv):
@@ -100,6 +101,23 @@ def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(sho
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_trials_on_a_gpu_are_played_one_at_a_time(monkeypatch):
+    """Also those of one episode: an environment that records a CUDA graph bears no random numbers of another thread."""
+    used = set()
+
+    class Recorder(Counting):
+        def predict(self, *arguments, **options):
+            used.add(threading.get_ident())
+            time.sleep(0.01)
+            return super().predict(*arguments, **options)
+
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    evaluate([fake_trial(Recorder(), 1, together=True) for _ in range(3)])
+    assert len(used) == 1
+    evaluate([fake_trial(Recorder(), 1) for _ in range(3)])
+    assert len(used) > 2
+
+
 def test_noise_differs_between_layouts_and_steps():
     class Recorder(LinearPolicy):
         def __init__(self):
@@ -115,18 +133,18 @@ def test_noise_differs_between_layouts_and_steps():
     assert len(policy.drawn) == 12 and len(torch.stack(policy.drawn).unique(dim=0)) == 12
 
 
-@pytest.mark.parametrize("batch", [1, 2, 6])
-def test_returns_are_in_the_order_of_layouts(batch):
+@pytest.mark.parametrize("together", [False, True])
+def test_returns_are_in_the_order_of_layouts(together):
     # The later three are too high and end at once, which costs no steps where each has an environment of its own.
     policy = Counting()
-    result = evaluate([fake_trial(policy, 6, batch, end_above=0.25)])[0]
+    result = evaluate([fake_trial(policy, 6, together, end_above=0.25)])[0]
     assert result.returns == pytest.approx([2.0, 2.4, 2.8, 0.8, 0.9, 1.0])
     # The highest one succeeds; like the one below it, it has been torn.
     assert result.success == pytest.approx(1 / 6) and result.success_whole == 0.0
     assert result.torn == pytest.approx(2 / 6)
     assert result.piece == pytest.approx((3 * 1.0 + 3 * 0.8) / 6)
     assert result.mean_piece == pytest.approx((3 * 0.9 + 3 * 0.8) / 6)
-    if batch == 1:
+    if not together:
         assert policy.steps == 3 * 4 + 3
 
 
