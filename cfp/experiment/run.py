@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import textwrap
@@ -146,6 +147,8 @@ class TrainingRun:
                 if number < self.stages and read_policy(newest)[1]["stage"] == number:
                     copy_policy(newest, policy_path(self.folder, number))
                 self.offset += learner.num_timesteps
+                del learner
+                gc.collect()  # callbacks refer to it; its replay memory would be there beside the next one
         except NonFiniteError as error:
             raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
         finally:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -49,6 +50,21 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         assert all(torch.equal(value, actor.coarse.encoder.state_dict()[key]) for key, value in before.items())
         same = before.keys() == after.keys() and all(torch.equal(value, after[key]) for key, value in before.items())
         assert same == (encoder == "small")
+
+
+def test_the_first_replay_memory_is_gone_when_the_second_stage_begins(tmp_path, monkeypatch):
+    """On a GPU each takes a third of the memory."""
+    memories, create = weakref.WeakSet(), CFPSAC.create.__func__
+
+    def created(*arguments):
+        assert not memories
+        learner = create(*arguments)
+        memories.add(learner.replay_buffer)
+        return learner
+
+    monkeypatch.setattr(CFPSAC, "create", classmethod(created))
+    assert run(tmp_path / "run") == 0
+    assert not memories
 
 
 @pytest.mark.parametrize(
