@@ -82,12 +82,16 @@ class Camera:
 
     def draw(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """:meth:`observe` in torch operations."""
+        return self.levels(x, v, origin, centre).to(torch.uint8)
+
+    def levels(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
+        """The image before it is rounded down, (B, 3, 64, 64), 0 to 255."""
         row, column = crop_corner(centre_in_window(self.view, centre, origin))
         shown = self.raster_input(x, v, origin, row, column)
         alike = not self.window.moves and None not in self.view  # for all elements
         corners = (corner[:1] if alike else corner for corner in (origin, row, column))
         shown = shown._replace(background=draw_boxes(self.boxes, *corners))
-        return encode(pixel_means(shown) if self.pixels else splat_means(shown)).to(torch.uint8)
+        return encode(pixel_means(shown) if self.pixels else splat_means(shown))
 
     def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image in the units of the uint8 one as a smooth function of its arguments.

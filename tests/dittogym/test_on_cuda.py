@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from tiny import TASKS, actions, tiny
+from tiny import TASKS, actions, on_edge, tiny
 
 import dittogym
 from dittogym.conditions import act, seen
@@ -132,4 +132,4 @@ def test_the_kernel_draws_what_torch_does(task: str, particles: str) -> None:
     state, camera = env.env_state, env.model.camera
     arrays = state.particles.x, state.particles.v, state.origin, state.centre
     difference = (camera.observe(*arrays).int() - camera.draw(*arrays).int()).abs()
-    assert difference.max() <= 1 and (difference > 0).double().mean() <= 1e-3
+    assert difference.max() <= 1 and (difference.bool() & ~on_edge(env)).double().mean() <= 1e-3

@@ -32,6 +32,18 @@ def make_vec(task: str = "run", num_envs: int = 2, **options: Any) -> gymnasium.
     return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
 
 
+def on_edge(env: dittogym.TorchEnv) -> torch.Tensor:
+    """Entries of the picture that rounding of the sums may bring to either of two bytes, (B, 3, 64, 64) bool.
+
+    Such are those of an object at rest: zero velocity is 132, and what is just below is 131.
+    """
+    state = env.env_state
+    arrays = (state.particles.x, state.particles.v, state.origin, state.centre)
+    exact = env.model.camera.levels(*(array.double() for array in arrays))
+    gap = (exact - exact.round()).abs()
+    return (gap > 0) & (gap < 2e-3)  # empty space is exact
+
+
 def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
     """Random actions (steps, B, 2, R, R)."""
     generator = torch.Generator().manual_seed(seed)
