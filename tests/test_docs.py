@@ -57,11 +57,14 @@ def test_options_of_an_algorithm_have_returns_of_their_own(monkeypatch):
     about = {"task": "run", "particles": "full", "observes": "nothing", "mean": "1", "episodes": "3"}
     rows = [
         about | {"algorithm": "`gradient`"},
-        about | {"algorithm": "`gradient --polish 90`", "mean": "2", "episodes": "5"},
+        about | {"algorithm": "`gradient --learning-rate 0.1 --polish 90`", "mean": "2", "episodes": "5"},
     ]
     monkeypatch.setattr(tables, "read", lambda name: rows if name == "returns.csv" else [])
     _, _, *lines = tables.returns().splitlines()
-    assert [line.split(" | ")[1:4:2] for line in lines] == [["`gradient`", "1"], ["`gradient --polish 90`", "2"]]
+    assert [line.split(" | ")[1:4:2] for line in lines] == [
+        ["`gradient`", "1"],
+        ["`gradient --learning-rate 0.1 --polish 90`", "2"],
+    ]
 
 
 def test_episodes_that_chose_a_policy_are_not_said_to_be_above_the_paper():
