@@ -53,6 +53,26 @@ def test_table_of_evaluations_is_made_of_the_rows_that_exist(tmp_path, monkeypat
     assert (noisy["latency"], noisy["matter"], noisy["noise"]) == ("0.50 (0.58)", "0.80 (0.83)", "")
 
 
+def test_options_of_an_algorithm_have_returns_of_their_own(monkeypatch):
+    about = {"task": "run", "particles": "full", "observes": "nothing", "mean": "1", "episodes": "3"}
+    rows = [
+        about | {"algorithm": "`gradient`"},
+        about | {"algorithm": "`gradient --learning-rate 0.1 --polish 90`", "mean": "2", "episodes": "5"},
+    ]
+    monkeypatch.setattr(tables, "read", lambda name: rows if name == "returns.csv" else [])
+    _, _, *lines = tables.returns().splitlines()
+    assert [line.split(" | ")[1:4:2] for line in lines] == [
+        ["`gradient`", "1"],
+        ["`gradient --learning-rate 0.1 --polish 90`", "2"],
+    ]
+
+
+def test_episodes_that_chose_a_policy_are_not_said_to_be_above_the_paper():
+    row = {"mean": "9000.0", "interval": "100.0"}
+    assert tables.compared(row | {"task": "run"}, 8650) == "**9,000 ± 100**"
+    assert tables.compared(row | {"task": "obstacle"}, 8650) == "9,000 ± 100"
+
+
 @pytest.mark.parametrize("name", ["returns.svg", *(f"tasks/{task}.png" for task in drawings.dittogym.TASKS)])
 def test_pictures_are_current(name):
     assert drawings.source(name).encode() in (DOCS / "images" / name).read_bytes(), "python docs/drawings.py draws them"

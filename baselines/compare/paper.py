@@ -21,6 +21,19 @@ CURVES: dict[str, tuple[tuple[float, float], ...]] = {
     "slot": ((65000, 2600), (49800, 9300), (12800, 2100), (6480, 2310), (5120, 1610), (26000, 5400), (23300, 6600)),
 }
 
+#: Task to what is left of the return of the paper's CFP while a fifth of its actions, or of its images, is set to 0: a
+#: quotient, read from the paper's bars.
+DROPOUT: dict[str, tuple[float, float]] = {
+    "shapematch": (0.91, 0.93),
+    "run": (0.95, 0.88),
+    "grow": (0.89, 0.89),
+    "kick": (0.99, 0.08),
+    "dig": (0.73, 0.68),
+    "obstacle": (0.94, 0.33),
+    "catch": (0.99, 0.92),
+    "slot": (0.97, 0.94),
+}
+
 #: Task to environment steps of its curves.
 STEPS = {task: (PUBLISHED | PAPER[task])["steps"] for task in CURVES}
 
