@@ -102,7 +102,7 @@ class FolderInUse(CFPError):
 
 
 @contextmanager
-def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
+def run_lock(folder: Path) -> Iterator[None]:
     """Hold the folder of a run, which is created if need be; the system releases it however the process ends."""
     is_new = not folder.exists()
     try:
@@ -111,7 +111,7 @@ def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
         raise ConfigError(f"out: {folder} cannot be created as a folder ({error.strerror})") from error
     path = folder / ".lock"
     try:
-        lock = FileLock(path).acquire(timeout=timeout)
+        lock = FileLock(path).acquire(timeout=0)
     except Timeout:
         owner = path.read_text().strip() if path.exists() else ""
         raise FolderInUse(f"out: {folder} is in use by {owner or 'another process'}") from None

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from threading import Timer
 
 import numpy as np
 import pytest
@@ -254,18 +253,14 @@ def test_folder_is_held_by_one_process_until_it_ends(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdin=pipe, stdout=pipe, text=True)
     assert process.stdout.readline() == "1\n"
     try:
-        for timeout in (0, 0.1):
-            with (
-                pytest.raises(FolderInUse, match=f"out: {folder} is in use by process {process.pid} on"),
-                run_lock(folder, timeout),
-            ):
-                pass
-        Timer(0.3, process.kill).start()
-        with run_lock(folder, 60):  # waits for it
-            assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} on ")
+        in_use = pytest.raises(FolderInUse, match=f"out: {folder} is in use by process {process.pid} on")
+        with in_use, run_lock(folder):
+            pass
     finally:
         process.kill()
         process.communicate()
+    with run_lock(folder):
+        assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} on ")
     assert folder.exists() and not list(folder.iterdir())
 
 
