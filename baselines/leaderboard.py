@@ -100,7 +100,7 @@ def episodes(task: str, policy: Policy) -> tuple[list[float], list[bool]]:
     if any(body.shape.draws for body in make_spec(task).bodies):
         played = play_episodes(config, policy, SEEDS, deterministic=True)
     else:
-        played = []
+        played = ()
         for seed, count in zip(SEEDS, COUNTS, strict=True):
             there = replace(config, particles=count)
             played += play_episodes(there, policy, [seed], deterministic=True)

@@ -14,7 +14,7 @@ from baselines.compare.plan import Run, reference_config
 from baselines.registry import sees
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
-from cfp.evaluation.returns import Played, evaluation_seed, make_trial, play
+from cfp.evaluation.returns import Played, evaluate, evaluation_seed, make_trial
 from cfp.policy import Policy
 from cfp.registry import algo_of
 
@@ -32,10 +32,10 @@ class Protocol:
         return task in paper.WITHOUT_NOISE if self.noise == "paper" else self.noise == "without"
 
 
-def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> list[Played]:
+def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> tuple[Played, ...]:
     """Play an episode of a policy on each of some consecutive layouts in the environment of a run's options."""
     trial = make_trial(config, "", policy, len(layouts), deterministic=deterministic, seed=layouts[0])
-    return play([trial], config.make_spec().horizon)[0]
+    return evaluate([trial], config.make_spec().horizon)[0].episodes
 
 
 def identity(run: Run) -> str:
