@@ -14,7 +14,7 @@ from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
 from cfp.config import EnvironmentConfig
 from cfp.learner import Resumable
-from cfp.policy import Policy, StatePolicy, check_trained_for, read_policy
+from cfp.policy import Policy, attached, check_trained_for, read_policy
 from dittogym import TorchEnv
 from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
 
@@ -41,7 +41,7 @@ class PolicyTeacher(Teacher):
     @torch.no_grad()
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """Mean actions (B, 2, R, R) of the policy."""
-        policy = self.policy.attached(env) if isinstance(self.policy, StatePolicy) else self.policy
+        policy = attached(self.policy, env)
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)

@@ -26,7 +26,7 @@ from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import DIVERGED
 from cfp.errors import NonFiniteError
 from cfp.messages import progress_bar
-from cfp.policy import Memory, Observation, Policy, Start, StatePolicy
+from cfp.policy import Memory, Observation, Policy, Start, attached
 from dittogym import Conditions, TorchEnv
 from dittogym.copies import to_device, to_host
 from dittogym.env import as_numpy
@@ -94,11 +94,6 @@ class UntrainedPolicy:
 
 
 # Playing episodes.
-
-
-def attached(policy: PolicyPredictor, env: TorchEnv) -> PolicyPredictor:
-    """A policy for an environment: shown the state if it acts on that."""
-    return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 
 
 class SeededPolicy:

@@ -11,9 +11,9 @@ import numpy as np
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_seed, without_noise
+from cfp.evaluation.returns import Noise, SeededPolicy, evaluation_seed, without_noise
 from cfp.messages import say
-from cfp.policy import Policy
+from cfp.policy import Policy, attached
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
 from dittogym.render.recording import OPTIONS, Act, FilmOptions, Recording, record

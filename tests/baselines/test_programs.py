@@ -19,7 +19,7 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.callbacks import EvaluationCallback
-from cfp.policy import StatePolicy, describe_run, read_policy
+from cfp.policy import attached, describe_run, read_policy
 from cfp.presets import sac_preset
 from cfp.tables import read_table
 
@@ -111,10 +111,9 @@ def test_run_leaves_its_files(finished):
 def test_policy_is_loaded_by_its_kind_and_evaluated(finished, tmp_path, capsys):
     algo, folder = finished
     images, policy = np.zeros((3, 3, 64, 64), np.uint8), baselines.load(folder)
-    if isinstance(policy, StatePolicy):
-        env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
-        env.reset(seed=0)
-        policy = policy.attached(env)
+    env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
+    env.reset(seed=0)
+    policy = attached(policy, env)
     actions, _ = policy.predict(images, None, np.ones(3, bool), True)
     assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
     size = 64 if algo.startswith(("gnn", "transformer")) else 8
