@@ -22,10 +22,9 @@ from cfp.experiment.folder import FolderInUse, run_lock
 from cfp.files import write_atomically
 from cfp.presets import sac_preset
 from cfp.sac.learner import CFPSAC
-from cfp.sac.replay import ReplayRing
+from cfp.sac.replay import FIELDS, ReplayRing
 
 SPACES = spaces.Box(0, 255, (3, 64, 64), np.uint8), spaces.Box(-1, 1, (2, 8, 8), np.float32)
-FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 SAC = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,), device="cpu")
 
 
