@@ -22,7 +22,7 @@ from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
 from cfp.experiment.callbacks import OnEvaluation
 from cfp.experiment.cli import Stopped, StopSignals, program_name, read_command, run_command
-from cfp.experiment.folder import Folder, folder_option, holds_run, read_config, run_lock
+from cfp.experiment.folder import Folder, holds_run, parse_folder, read_config, run_lock
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 from cfp.messages import say
@@ -79,7 +79,7 @@ def parse(words: Sequence[str], module: str = "cfp.train", started: str | None =
         first.seed = None  # which is refused below
     values = _read_file(first.config)
     values |= {name: value for name in DECISIVE if (value := getattr(first, name)) not in (None, False)}
-    defaults, out = _defaults(values, None if first.out is None else folder_option([first.out]), first.resume)
+    defaults, out = _defaults(values, None if first.out is None else parse_folder("out", first.out), first.resume)
     algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}.\nTasks: {', '.join(dittogym.TASKS)}."
     about = f"{inspect.cleandoc(Command.__doc__ or '')}\n\n{algorithms}"
     command = read_command(Command, module, EXAMPLES, words, started, about, default=Command(defaults, out=out))

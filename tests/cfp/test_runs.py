@@ -130,8 +130,8 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
         ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the other learner only
         ({"refine": True}, "refine requires start_from"),
         ({"warmup": 3, "task": "nowhere"}, "task must be .* got 'nowhere'"),
-        ({"out": ""}, "out must be the path of a folder, got ''"),
-        ({"out": 5}, "out must be the path of a folder, got 5"),
+        ({"out": ""}, "out must name a folder, got ''"),
+        ({"out": b"run"}, "out must name a folder, got b'run'"),
         ({"out": Path(__file__)}, "out must be a folder, got the file"),
     ],
 )
