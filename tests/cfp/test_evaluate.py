@@ -11,7 +11,7 @@ from fakes import FakeEnv
 
 from cfp import messages
 from cfp.errors import ConfigError
-from cfp.evaluate import Selection
+from cfp.evaluate import Command
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
 from dittogym import Conditions, TorchEnv
@@ -170,11 +170,12 @@ def test_an_episode_that_fails_ends_the_others():
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():
-    config, _ = Selection(policy="run", dt=2e-4).open()
+    config, _ = Command(policy="run", dt=2e-4).open()
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
-    with pytest.raises(ConfigError, match="dt must divide"):
-        Selection(policy="run", dt=3e-4).open()
+    for dt, message in ((3e-4, "dt must divide an environment step"), (0.0, "dt must be positive")):
+        with pytest.raises(ConfigError, match=f"^{message}"):
+            Command(policy="run", dt=dt).open()
 
 
 def test_the_seed_chooses_the_episodes():
-    assert [Selection(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]
+    assert [Command(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]
