@@ -137,12 +137,6 @@ class Modular(SACLearner):
         description = {"resolution": self.config.resolution(self.stage)}
         return SegmentPolicy(cast(ModularActor, self.trained_actor), self.config.nodes, description)
 
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actor."""
-        policy = self.trained_policy
-        policy.description = description
-        policy.save(path)
-
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
         """Load a policy."""
