@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch.nn import functional as F
-from updates import learn
+from watching import learn
 
 import cfp
 import cfp.train

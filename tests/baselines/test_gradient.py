@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from updates import learn
+from watching import learn
 
 import dittogym
 from baselines import Gradient, OpenLoop

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from updates import learn
+from watching import learn
 
 import baselines
 import baselines.shac
