@@ -363,6 +363,7 @@ class Session:
             raise ValueError("there is no moment to go back to: save one first")
         snapshot, history = self.saved
         self.history, self.seed = history.copy(), history.seed  # what came after it did not happen
+        self.rows.clear()
         self.observation, state = self.env.load(snapshot), self.env.env_state
         values, then = physics_values(self.physics, self.env.num_particles, state.centre[:, 0]), state.physics
         self.env.env_state = replace(state, physics=values)
