@@ -31,6 +31,19 @@ WITHOUT_INFLUENCE = ("backend", "checkpoint_every", "device", "log_every", "vide
 RECORD = "comparison.json"
 
 
+def read_record(folder: Path) -> dict[str, Any]:
+    """What `RECORD` in a folder holds; nothing before a comparison has begun the run there.
+
+    Raises:
+        ConfigError: It cannot be read.
+    """
+    path = folder / RECORD
+    try:
+        return read_json(path) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
+
+
 @dataclass(frozen=True)
 class Run:
     """One element of a plan."""
@@ -58,12 +71,8 @@ class Run:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What `RECORD` holds; nothing before the run has begun. A `ConfigError` if it cannot be read."""
-        path = self.folder / RECORD
-        try:
-            return read_json(path) if path.exists() else {}
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path}: cannot be read ({error})") from error
+        """What `RECORD` holds, see `read_record`."""
+        return read_record(self.folder)
 
     def update_record(self, **values: Any) -> None:
         """Put values into the record."""
