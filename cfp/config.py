@@ -69,7 +69,7 @@ class EnvironmentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """What is learned by what."""
+    """What is learned, by what and where; these options choose the defaults of all others."""
 
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
