@@ -371,25 +371,22 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
 def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Results as JSON values."""
     return [
-        {"policy": result.name, "action": f"{result.resolution}x{result.resolution}", **numbers(result)}
+        {
+            "policy": result.name,
+            "action": f"{result.resolution}x{result.resolution}",
+            "episodes": len(result.returns),
+            "mean": round(result.mean, 3),
+            "std": round(result.std, 3),
+            "interval": None if result.interval is None else round(result.interval, 3),
+            "returns": [round(value, 3) for value in result.returns],
+            "success": result.success,
+            "success_whole": result.success_whole,
+            "torn": result.torn,
+            "piece": round(result.piece, 4),
+            "mean_piece": round(result.mean_piece, 4),
+        }
         for result in results
     ]
-
-
-def numbers(result: Result) -> dict[str, Any]:
-    """Numbers of a result as JSON values."""
-    return {
-        "episodes": len(result.returns),
-        "mean": round(result.mean, 3),
-        "std": round(result.std, 3),
-        "interval": None if result.interval is None else round(result.interval, 3),
-        "returns": [round(value, 3) for value in result.returns],
-        "success": result.success,
-        "success_whole": result.success_whole,
-        "torn": result.torn,
-        "piece": round(result.piece, 4),
-        "mean_piece": round(result.mean_piece, 4),
-    }
 
 
 def format_table(config: RunConfig, results: Sequence[Result]) -> str:

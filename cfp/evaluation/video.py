@@ -36,12 +36,11 @@ def record_episode(
 ) -> Recorded:
     """One episode of a policy."""
     env = make_torch_env(config, policy.resolution, 1)
-    acting, memory, start = SeededPolicy(attached(policy, env), seed), None, np.array([True])
+    acting, memory = SeededPolicy(attached(policy, env), seed), None
 
     def act(observation: np.ndarray) -> np.ndarray:
-        nonlocal memory, start
-        action, memory = acting.predict(observation, memory, start, deterministic)
-        start = np.array([False])
+        nonlocal memory
+        action, memory = acting.predict(observation, memory, deterministic=deterministic)
         return action
 
     return recorder(env, act, seed)
