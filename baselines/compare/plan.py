@@ -10,7 +10,7 @@ from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.registry import ALGORITHMS
-from cfp.config import EVALUATION_SEED, RunConfig, to_words
+from cfp.config import EVALUATION_SEED, RunConfig, differences, to_words
 from cfp.errors import ConfigError
 from cfp.experiment.run import check_options
 from cfp.files import read_json, write_json
@@ -96,12 +96,10 @@ class Run:
             if (self.folder / "config.json").exists():
                 raise ConfigError(f"out: {self.folder} holds a run that no comparison has begun; name another --out")
             return
-        mine = json.loads(json.dumps(self.options))
-        for name in sorted({*mine, *there} - {*WITHOUT_INFLUENCE}):
-            if mine.get(name) != there.get(name):
+        for name, (old, new) in differences(there, json.loads(json.dumps(self.options))).items():
+            if name not in WITHOUT_INFLUENCE:
                 raise ConfigError(
-                    f"{name} must be {there.get(name)!r} as in the run in {self.folder}, got {mine.get(name)!r}; "
-                    "or name another --out"
+                    f"{name} must be {old!r} as in the run in {self.folder}, got {new!r}; or name another --out"
                 )
 
 
