@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal
 
 import dittogym
 from cfp import registry
@@ -27,8 +27,6 @@ from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 from cfp.messages import say
 
-#: How the coarse-to-fine policy learns.
-Learner: TypeAlias = Literal["analytic", "sac"]
 EXAMPLES = (
     "--task run",
     "--task shapematch --target M --seed 1 --out runs/M",
@@ -51,7 +49,7 @@ class Command:
     """
 
     run: RunConfig
-    learner: Learner | None = None
+    learner: Literal["analytic", "sac"] | None = None
     """How the coarse-to-fine policy learns: short for --algo cfp-analytic and --algo cfp-sac."""
     out: Folder | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
@@ -71,8 +69,8 @@ def parse(words: Sequence[str], module: str = "cfp.train", started: str | None =
     for name in ("refine", "resume"):
         scan.add_argument(f"--{name}", action="store_true")
     first, _ = scan.parse_known_args(words)
-    if first.algo is None and first.learner in get_args(Learner):
-        first.algo = f"cfp-{first.learner}"
+    if first.algo is None and (algo := f"cfp-{first.learner}") in registry.ALGORITHMS:
+        first.algo = algo
     try:
         first.seed = None if first.seed is None else int(first.seed)
     except ValueError:
