@@ -34,8 +34,8 @@ class Teacher(Resumable, ABC):
 class PolicyTeacher(Teacher):
     """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
-    def __init__(self, policy: Policy, indexing: ActionLayout) -> None:
-        self.policy, self.indexing = policy, indexing
+    def __init__(self, policy: Policy, action_layout: ActionLayout) -> None:
+        self.policy, self.action_layout = policy, action_layout
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
@@ -45,8 +45,8 @@ class PolicyTeacher(Teacher):
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
-        own = trained_layout(self.policy) or self.indexing
-        return from_grid_layout(to_grid_layout(torch.as_tensor(array, device=env.device), own), self.indexing)
+        own = trained_layout(self.policy) or self.action_layout
+        return from_grid_layout(to_grid_layout(torch.as_tensor(array, device=env.device), own), self.action_layout)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""
