@@ -10,7 +10,8 @@ from watching import learn
 import baselines
 import baselines.shac
 from baselines import Shac, StatePolicy
-from baselines.shac import METRICS
+from baselines.shac import METRICS, StateActor
+from cfp.analytic.critic import StateFeatures
 from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env, make_torch_env
 from cfp.errors import CheckpointError, NonFiniteError
@@ -157,6 +158,18 @@ def test_policy_goes_through_its_file(tmp_path):
     trials = [make_trial(learner.config, "", each, 2, deterministic=False, seed=3) for each in policies]
     results = evaluate(trials)
     assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("left_out", ["deformation", "clock"])
+def test_files_of_policies_that_observe_less_load(tmp_path, left_out):
+    """Options for which there was no use once trained such policies."""
+    config, features = options(), StateFeatures(**{left_out: False})
+    StatePolicy(StateActor(features.size(0), 8), features, 0.1, describe_run(config, "shac", 1, 0)).save(
+        tmp_path / "policy.safetensors"
+    )
+    env = make_torch_env(config, 8, 2)
+    images = env.reset()[0].numpy()
+    assert baselines.load(tmp_path).attached(env).predict(images)[0].shape == (2, 2, 8, 8)
 
 
 def test_policy_of_the_state_says_what_it_needs(tmp_path):
