@@ -112,7 +112,7 @@ def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values; ``name`` is for programs, ``title`` and ``description`` are for readers."""
+    """Rows of plain values; ``name`` tells tables apart, ``title`` and ``description`` are for readers."""
 
     name: str
     title: str
