@@ -21,7 +21,7 @@ import tyro
 import torchmpm
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluation import play_episodes
-from baselines.compare.plan import RECORD
+from baselines.compare.plan import read_record
 from baselines.compare.report import SEES
 from baselines.registry import configure, load, sees
 from cfp.config import EnvironmentConfig, RunConfig
@@ -100,7 +100,7 @@ def episodes(task: str, policy: Policy) -> tuple[list[float], list[bool]]:
     if any(body.shape.draws for body in make_spec(task).bodies):
         played = play_episodes(config, policy, SEEDS, deterministic=True)
     else:
-        played = []
+        played = ()
         for seed, count in zip(SEEDS, COUNTS, strict=True):
             there = replace(config, particles=count)
             played += play_episodes(there, policy, [seed], deterministic=True)
@@ -141,7 +141,7 @@ def candidates(name: str, tasks: Sequence[str]) -> list[tuple[dict[str, Any], Po
 
 def _minutes(folder: Path) -> float | None:
     """Wall time of a training that a comparison has made; None if it is not known."""
-    record = read_json(folder / RECORD) if (folder / RECORD).exists() else {}
+    record = read_record(folder)
     return round(record["seconds"] / 60, 1) if "seconds" in record else None
 
 

@@ -1,10 +1,8 @@
 """The other algorithms, which this module adds to `cfp.registry`."""
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from cfp import registry
-from cfp.errors import ConfigError
 from cfp.learner import Sees
-from cfp.registry import ALGORITHMS, configure, find, load
+from cfp.registry import ALGORITHMS, OTHER_NAMES, configure, find, load
 
 __all__ = ["ALGORITHMS", "configure", "find", "load", "sees"]
 
@@ -21,17 +19,10 @@ ALGORITHMS |= {
     "cem": "baselines.planning.mpc:CEM",
     "shac": "baselines.shac:Shac",
 }
-
-
-def _is_not_trained(name: str) -> ConfigError | None:
-    if name not in REFERENCE_POLICIES:
-        return None
-    return ConfigError(
-        f"algo: {name!r} is a reference policy, which is not trained; evaluate it with: torchmpm compare --algos {name}"
-    )
-
-
-registry.EXPLANATIONS.append(_is_not_trained)
+OTHER_NAMES |= {
+    name: f"algo: {name!r} is a reference policy, which is not trained; evaluate it: torchmpm compare --algos {name}"
+    for name in REFERENCE_POLICIES
+}
 
 
 def sees(name: str) -> Sees:

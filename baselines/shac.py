@@ -20,7 +20,7 @@ from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_
 from cfp.config import RunConfig, WindowConfig
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError, check_at_least
-from cfp.learner import Learner, NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
+from cfp.learner import NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
 from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from cfp.presets import ON_SPEED, sac_preset
 from dittogym import TorchEnv
@@ -130,7 +130,7 @@ class StatePolicy(StateBasedPolicy):
             return cls(actor, StateFeatures(**description["features"]), float(description["noise"]), description)
 
 
-class Shac(Resumable, UpdateLoop, Learner):
+class Shac(Resumable, UpdateLoop):
     """Actor and critic on windows of differentiable simulation.
 
     The actor maximises the discounted rewards of a window plus the target critic's value of its end, through the
@@ -272,12 +272,6 @@ class Shac(Resumable, UpdateLoop, Learner):
         """Networks and environment."""
         env = make_env(config.for_training(), config.resolution(stage))
         return cls("NetworksPolicy", env, config, stage, choose_device(config.device))
-
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy."""
-        policy = self.trained_policy
-        policy.description = description
-        policy.save(path)
 
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> StatePolicy:

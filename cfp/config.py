@@ -69,7 +69,7 @@ class EnvironmentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """What is learned by what."""
+    """What is learned, by what and where; these options choose the defaults of all others."""
 
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
@@ -129,16 +129,21 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         """These options, with the environment that is trained in."""
         return self
 
-    def simulated_with(self: Config, particles: Particles | None = None, dt: float | None = None) -> Config:
-        """These options with other particles, and with the same environment step in substeps of ``dt`` s, if given."""
+    def simulated_with(
+        self: Config, particles: Particles | None = None, dt: float | None = None, option: str = "train_dt"
+    ) -> Config:
+        """These options with other particles, and with the same environment step in substeps of ``dt`` s, if given.
+
+        A `ConfigError` about ``dt`` names the ``option``.
+        """
         config = self if particles is None else replace(self, particles=particles)
         if dt is None or dt == self.dt:
             return config
-        check_positive(train_dt=dt)
+        check_positive(**{option: dt})
         ratio = self.control_step / dt
         substeps = round(ratio) if math.isfinite(ratio) else 0
         if not math.isclose(substeps * dt, self.control_step):
-            raise ConfigError(f"train_dt must divide an environment step of {self.control_step} s, got {dt}")
+            raise ConfigError(f"{option} must divide an environment step of {self.control_step} s, got {dt}")
         return replace(config, dt=dt, substeps=substeps)
 
     def ends(self) -> tuple[int, ...]:

@@ -33,42 +33,6 @@ EXAMPLES = (
 
 
 @dataclass(frozen=True)
-class Selection:
-    """Which policies, and where they are evaluated."""
-
-    folder: tyro.conf.Positional[Path | None] = None
-    """Run folder, of a finished training or of one in progress."""
-    policy: str | None = None
-    """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
-    seed: int | None = None
-    """Seed of initial particle positions and noise; the run's own if not given."""
-    particles: Particles | None = None
-    """Particles: full (the paper's), lite, or counts; the run's own if not given."""
-    dt: float | None = None
-    """Duration of a substep, s; the run's own if not given."""
-    device: str = "auto"
-    """cpu, cuda, or auto."""
-
-    def open(self) -> tuple[RunConfig, dict[str, Policy]]:
-        """Options to evaluate with, and policies by stage, the newest last."""
-        if self.folder is not None and self.policy is None:
-            if not self.folder.exists() and str(self.folder) in shipped():
-                raise ConfigError(f"{self.folder}: there is no such folder; --policy {self.folder} names the policy")
-            config, policies = open_run(self.folder, self.device, self.seed)
-        elif self.policy is not None and self.folder is None:
-            config, policies = open_policy(self.policy, self.device, self.seed)
-        else:
-            given = "neither" if self.policy is None else "both"
-            raise ConfigError(f"either policy or a folder must be given, got {given}")
-        if self.particles is not None and self.particles != config.particles:
-            config = replace(config, particles=self.particles)
-        if self.dt is not None:
-            config = config.simulated_with(dt=self.dt)
-        config.check()
-        return config, policies
-
-
-@dataclass(frozen=True)
 class FilmOptions:
     """How the video looks."""
 
@@ -83,12 +47,24 @@ class FilmOptions:
 
 
 @dataclass(frozen=True)
-class Command(Selection):
+class Command:
     """Evaluate the policies of a run, or a single policy, in the same episodes, beside zero and random actions.
 
     They are evaluated in the task that they were trained for.
     """
 
+    folder: tyro.conf.Positional[Path | None] = None
+    """Run folder, of a finished training or of one in progress."""
+    policy: str | None = None
+    """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
+    seed: int | None = None
+    """Seed of initial particle positions and noise; the run's own if not given."""
+    particles: Particles | None = None
+    """Particles: full (the paper's), lite, or counts; the run's own if not given."""
+    dt: float | None = None
+    """Duration of a substep, s; the run's own if not given."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
     episodes: int = 5
     """Episodes of each row."""
     noise: Noise = "default"
@@ -105,6 +81,24 @@ class Command(Selection):
     record_fields: tuple[Literal["x", "v", "C", "F", "Jp"], ...] = ("x", "v")
     """Fields of the particles in that file: x, v, C, F and Jp are the whole state."""
     film: tyro.conf.OmitArgPrefixes[FilmOptions] = field(default_factory=FilmOptions)
+
+    def open(self) -> tuple[RunConfig, dict[str, Policy]]:
+        """Options to evaluate with, and policies by stage, the newest last."""
+        if self.folder is not None and self.policy is None:
+            if not self.folder.exists() and str(self.folder) in shipped():
+                raise ConfigError(f"{self.folder}: there is no such folder; --policy {self.folder} names the policy")
+            config, policies = open_run(self.folder, self.device, self.seed)
+        elif self.policy is not None and self.folder is None:
+            config, policies = open_policy(self.policy, self.device, self.seed)
+        else:
+            given = "neither" if self.policy is None else "both"
+            raise ConfigError(f"either policy or a folder must be given, got {given}")
+        if self.particles is not None and self.particles != config.particles:
+            config = replace(config, particles=self.particles)
+        if self.dt is not None:
+            config = config.simulated_with(dt=self.dt, option="dt")
+        config.check()
+        return config, policies
 
 
 def open_run(folder: Path, device: str, seed: int | None = None) -> tuple[RunConfig, dict[str, Policy]]:

@@ -74,14 +74,14 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Read a JSON object from a file of at most ``largest`` bytes; ``OSError`` or ``ValueError`` if that fails."""
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object from a file of at most `LARGEST_JSON` bytes; ``OSError`` or ``ValueError`` if that fails."""
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
     with open(path, "rb") as file:
-        content = file.read(largest + 1)
-    if len(content) > largest:
-        raise ValueError(f"it is larger than {largest} bytes")
+        content = file.read(LARGEST_JSON + 1)
+    if len(content) > LARGEST_JSON:
+        raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
     value = parse_json(content.decode())
     if not isinstance(value, dict):
         raise ValueError(f"it must hold an object, got {type(value).__name__}")

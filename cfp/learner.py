@@ -27,6 +27,7 @@ from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import policy_path, start_path
+from cfp.hub import Shareable
 from cfp.policy import (
     KIND,
     ActorPolicy,
@@ -121,9 +122,11 @@ class Learner(ABC):
     def trained_policy(self) -> Policy:
         """What has been learned so far, as `save_policy` writes it."""
 
-    @abstractmethod
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
+        policy = cast(Shareable, self.trained_policy)
+        policy.description = description | policy.description
+        policy.save(path)
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -161,7 +164,7 @@ class NetworksPolicy(BasePolicy):
         return action
 
 
-class UpdateLoop(BaseAlgorithm):
+class UpdateLoop(BaseAlgorithm, Learner):
     """A stable-baselines3 algorithm that is neither off-policy nor on-policy: `update` both simulates and learns.
 
     Subclasses make simulation and networks in ``_setup_model``, and call `after_step` after each control step of all
@@ -232,9 +235,6 @@ class UpdateLoop(BaseAlgorithm):
                 self.logger.dump(self.num_timesteps)
         self._callback.on_training_end()
         return self
-
-    def log_row(self) -> None:
-        """Record what belongs into a row of the logs beside the scalars of `update`."""
 
     def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import safetensors
@@ -27,7 +27,7 @@ from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig,
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
 from cfp.hub import SCHEME, Shareable, download
-from dittogym import make_spec
+from dittogym import TorchEnv, make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES
 from dittogym.observation import SHAPE
@@ -88,12 +88,9 @@ class Policy(Protocol):
         """Choose actions, see `ActorPolicy.predict`."""
 
 
-@runtime_checkable
-class StatePolicy(Protocol):
-    """A policy that acts on the state of the simulation, beside or instead of the image."""
-
-    def attached(self, env: Any) -> Policy:
-        """The same policy, acting on the state of a `dittogym.TorchEnv`."""
+def attached(policy: Any, env: TorchEnv) -> Any:
+    """A policy for an environment: one that acts on the state of the simulation is shown that of ``env``."""
+    return policy.attached(env) if hasattr(policy, "attached") else policy
 
 
 def check_images(observation: object) -> None:

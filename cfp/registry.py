@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,14 @@ ALGORITHMS: dict[str, str] = {
     "cfp-analytic": "cfp.analytic.learner:CFPAnalytic",
     "cfp-sac": "cfp.sac.learner:CFPSAC",
 }
-#: Makes the error for a name that is no algorithm but something else; `baselines` knows policies that are not trained.
-EXPLANATIONS: list[Callable[[str], ConfigError | None]] = []
+#: What to say of names that are no algorithms but something else; `baselines` knows policies that are not trained.
+OTHER_NAMES: dict[str, str] = {}
 
 
 def find(name: str) -> type[Learner]:
     """The class of an algorithm; a `ConfigError` if there is none of that name."""
     if name not in ALGORITHMS:
-        for explain in EXPLANATIONS:
-            if (error := explain(name)) is not None:
-                raise error
-        raise ConfigError(f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+        raise ConfigError(OTHER_NAMES.get(name, f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}"))
     module, _, attribute = ALGORITHMS[name].partition(":")
     algorithm: type[Learner] = getattr(import_module(module), attribute)
     return algorithm

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 from io import BytesIO
-from pathlib import Path
 from typing import Any, cast
 
 from cfp import messages, registry
@@ -36,11 +35,11 @@ class Run:
 
     Raises:
         CheckpointError: There is no run.
-        ConfigError: It cannot be the path of a folder.
+        ConfigError: ``folder`` cannot be the name of one.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = _folder("folder", folder)
+        self.folder = parse_folder("folder", folder)
         self.config: RunConfig = read_config(self.folder, registry.configure)
 
     @cached_property
@@ -113,13 +112,6 @@ class Run:
         return picture.getvalue()
 
 
-def _folder(name: str, given: Any) -> Path:
-    try:
-        return parse_folder([os.fspath(given)])
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{name} must be the path of a folder, got {given!r}") from error
-
-
 def fit(
     task: str,
     *,
@@ -183,7 +175,7 @@ def fit(
     for name, flag in (("resume", resume), ("quiet", quiet)):
         if not isinstance(flag, bool):
             raise ConfigError(f"{name} must be True or False, got {flag!r}")
-    command = from_python({"task": task, **options}, None if out is None else _folder("out", out), resume)
+    command = from_python({"task": task, **options}, None if out is None else parse_folder("out", out), resume)
     keep_memory()
     try:
         with printable(), messages.quiet(quiet):

@@ -81,8 +81,8 @@ Row = Mapping[str, Any]
 class Column:
     """A column of a table."""
 
-    key: str  # in the rows, and the name in the CSV file
-    title: str = ""  # an empty one restricts the column to the CSV file
+    key: str  # in the rows
+    title: str
     format: str = ""  # of numbers; columns without one hold text
 
     def text(self, row: Row) -> str:
@@ -112,7 +112,7 @@ def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values; ``name`` is that of the CSV file, ``title`` and ``description`` are for readers."""
+    """Rows of plain values; ``name`` tells tables apart, ``title`` and ``description`` are for readers."""
 
     name: str
     title: str
@@ -120,31 +120,22 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Row]
 
-    @property
-    def visible(self) -> list[Column]:
-        """Columns for readers."""
-        return [column for column in self.columns if column.title]
-
-    def to_csv(self) -> str:
-        """All columns, with raw values."""
-        return csv_text(self.rows, [column.key for column in self.columns])
-
     def to_markdown(self) -> str:
-        """Heading, description and visible columns."""
+        """Heading, description and rows."""
         lines = [f"## {self.title}", "", self.description]
         if self.rows:
-            titles = [column.title for column in self.visible]
-            alignments = ["---:" if column.format else "---" for column in self.visible]
-            rows = [[column.text(row).replace("|", "\\|") for column in self.visible] for row in self.rows]
+            titles = [column.title for column in self.columns]
+            alignments = ["---:" if column.format else "---" for column in self.columns]
+            rows = [[column.text(row).replace("|", "\\|") for column in self.columns] for row in self.rows]
             lines += ["", *(f"| {' | '.join(cells)} |" for cells in (titles, alignments, *rows))]
         return "\n".join(lines)
 
     def to_html(self) -> str:
-        """Heading, description and visible columns."""
+        """Heading, description and rows."""
         head = f"<h2>{escape(self.title)}</h2>\n"
         head += f'<p class="note">{escape(self.description)}</p>\n' if self.description else ""
         if not self.rows:
             return head
-        titles, *rows = ("".join(column.html(row) for column in self.visible) for row in (None, *self.rows))
+        titles, *rows = ("".join(column.html(row) for column in self.columns) for row in (None, *self.rows))
         body = "\n".join(f"<tr>{row}</tr>" for row in rows)
         return f'{head}<div class="wide"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'

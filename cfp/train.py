@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal
 
 import dittogym
 from cfp import registry
@@ -22,13 +22,11 @@ from cfp.config import RunConfig, update_from_dict
 from cfp.errors import ConfigError
 from cfp.experiment.callbacks import OnEvaluation
 from cfp.experiment.cli import Stopped, StopSignals, program_name, read_command, run_command
-from cfp.experiment.folder import Folder, folder_option, holds_run, read_config, run_lock
+from cfp.experiment.folder import Folder, holds_run, parse_folder, read_config, run_lock
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 from cfp.messages import say
 
-#: How the coarse-to-fine policy learns.
-Learner: TypeAlias = Literal["analytic", "sac"]
 EXAMPLES = (
     "--task run",
     "--task shapematch --target M --seed 1 --out runs/M",
@@ -51,7 +49,7 @@ class Command:
     """
 
     run: RunConfig
-    learner: Learner | None = None
+    learner: Literal["analytic", "sac"] | None = None
     """How the coarse-to-fine policy learns: short for --algo cfp-analytic and --algo cfp-sac."""
     out: Folder | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
@@ -71,15 +69,15 @@ def parse(words: Sequence[str], module: str = "cfp.train", started: str | None =
     for name in ("refine", "resume"):
         scan.add_argument(f"--{name}", action="store_true")
     first, _ = scan.parse_known_args(words)
-    if first.algo is None and first.learner in get_args(Learner):
-        first.algo = f"cfp-{first.learner}"
+    if first.algo is None and (algo := f"cfp-{first.learner}") in registry.ALGORITHMS:
+        first.algo = algo
     try:
         first.seed = None if first.seed is None else int(first.seed)
     except ValueError:
         first.seed = None  # which is refused below
     values = _read_file(first.config)
     values |= {name: value for name in DECISIVE if (value := getattr(first, name)) not in (None, False)}
-    defaults, out = _defaults(values, None if first.out is None else folder_option([first.out]), first.resume)
+    defaults, out = _defaults(values, None if first.out is None else parse_folder("out", first.out), first.resume)
     algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}.\nTasks: {', '.join(dittogym.TASKS)}."
     about = f"{inspect.cleandoc(Command.__doc__ or '')}\n\n{algorithms}"
     command = read_command(Command, module, EXAMPLES, words, started, about, default=Command(defaults, out=out))

@@ -125,11 +125,6 @@ class OpenLoopLearner(Learner):
             callback.on_step()
         callback.on_training_end()
 
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actions; those made for one layout name it."""
-        policy = self.trained_policy
-        OpenLoop(policy.actions, description | policy.description).save(path)
-
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> OpenLoop:
         """Load actions."""

@@ -28,12 +28,13 @@ REFERENCE_POLICIES: dict[str, Callable[[RunConfig], Policy]] = {
 }
 
 
-def wave(steps: int, size: int, indexing: ActionLayout) -> Tensor:
+def wave(steps: int, size: int, action_layout: ActionLayout) -> Tensor:
     """The actions with which the reference figures of the tasks were recorded, (T, 2, R, R).
 
     In step t = 1, 2, ... the muscle of direction c in column x and row y of the action grid, counted to the right and
-    upwards, is driven with ``sin(0.3 t + 0.7 x + 1.1 y + 2 c)``, the same in the world for every indexing.
+    upwards, is driven with ``sin(0.3 t + 0.7 x + 1.1 y + 2 c)``, the same in the world whatever the layout of the
+    action array.
     """
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)
-    return from_grid_layout(torch.from_numpy(drive.astype(np.float32)), indexing)
+    return from_grid_layout(torch.from_numpy(drive.astype(np.float32)), action_layout)

@@ -15,7 +15,7 @@ from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.core import EnvState, Model, StepResult
 from torchmpm import trajectory
 
-#: From the task, a state and actions (B, 2, R, R) in grid indexing, such as :func:`dittogym.core.step`.
+#: From the task, a state and actions (B, 2, R, R) in the layout ``"grid"``, such as :func:`dittogym.core.step`.
 StepFunction: TypeAlias = Callable[[Model, EnvState, Tensor], StepResult]
 
 
@@ -52,7 +52,7 @@ def rollout(
     actions: Tensor,
     step: StepFunction = soft_step,
     *,
-    indexing: ActionLayout = "image",
+    action_layout: ActionLayout = "image",
     checkpointed: bool = True,
 ) -> Rollout:
     """Drive simulations through some control steps.
@@ -62,12 +62,12 @@ def rollout(
         start: Where the simulations start, B of them.
         actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
         step: Advances the simulations; by default the reward is the smooth one.
-        indexing: How the actions are indexed.
+        action_layout: Of the actions, see :class:`dittogym.TorchEnv`.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
     """
 
     def advance(before: _Step, action: Tensor) -> _Step:
-        result = step(model, before.state, to_grid_layout(action, indexing))
+        result = step(model, before.state, to_grid_layout(action, action_layout))
         reward, true_reward = (
             torch.where(before.ended, 0.0, value) for value in (result.reward, result.true_reward.detach())
         )

@@ -14,7 +14,7 @@ from baselines.compare.plan import Run, reference_config
 from baselines.registry import sees
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
-from cfp.evaluation.returns import Played, evaluation_seed, make_trial, play
+from cfp.evaluation.returns import Played, evaluate, evaluation_seed, is_plan, make_trial
 from cfp.policy import Policy
 from cfp.registry import algo_of
 
@@ -32,10 +32,10 @@ class Protocol:
         return task in paper.WITHOUT_NOISE if self.noise == "paper" else self.noise == "without"
 
 
-def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> list[Played]:
+def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], deterministic: bool) -> tuple[Played, ...]:
     """Play an episode of a policy on each of some consecutive layouts in the environment of a run's options."""
     trial = make_trial(config, "", policy, len(layouts), deterministic=deterministic, seed=layouts[0])
-    return play([trial], config.make_spec().horizon)[0]
+    return evaluate([trial], config.make_spec().horizon)[0].episodes
 
 
 def identity(run: Run) -> str:
@@ -46,7 +46,7 @@ def identity(run: Run) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 
-def conditions(run: Run, protocol: Protocol) -> dict[str, Any]:
+def requirements(run: Run, protocol: Protocol) -> dict[str, Any]:
     """What must be the same for an evaluation to count."""
     noise = not protocol.deterministic(run.task)
     own = {"episodes": protocol.episodes, "particles": protocol.particles, "noise": noise}
@@ -71,7 +71,7 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
     layouts = range(evaluation_seed(config), evaluation_seed(config) + protocol.episodes)
     episodes = play_episodes(config, policy, layouts, deterministic)
     own = None
-    if "layout" in policy.description:
+    if is_plan(policy):
         own = play_episodes(config, policy, [policy.description["layout"]], deterministic)[0].total
     found = {
         "observes": observes,
@@ -80,10 +80,10 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
         "successes": [episode.success for episode in episodes],
         "own_layout": own,
     }
-    run.update_record(evaluation=conditions(run, protocol) | found)
+    run.update_record(evaluation=requirements(run, protocol) | found)
 
 
 def read_evaluation(run: Run, protocol: Protocol) -> dict[str, Any] | None:
     """The evaluation of a run under a protocol; None if there is none."""
     found: dict[str, Any] = run.record.get("evaluation", {})
-    return found if conditions(run, protocol).items() <= found.items() else None
+    return found if requirements(run, protocol).items() <= found.items() else None

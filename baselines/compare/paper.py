@@ -4,7 +4,7 @@ They were measured from the drawn curves of training returns: mean and half the 
 the steps, three seeds. A resting robot was measured in the reference environment with full particles.
 """
 
-from cfp.presets import PAPER, PUBLISHED
+from cfp.presets import PAPER
 
 #: Names that the paper's methods have here, in the order of ``CURVES``.
 COLUMNS = ("cfp-sac", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
@@ -33,9 +33,6 @@ DROPOUT: dict[str, tuple[float, float]] = {
     "catch": (0.99, 0.92),
     "slot": (0.97, 0.94),
 }
-
-#: Task to environment steps of its curves.
-STEPS = {task: (PUBLISHED | PAPER[task])["steps"] for task in CURVES}
 
 _REST = (21, 2500, 3100, 890, -1500, 2400, -1900, 7000)
 #: Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles).

@@ -10,7 +10,7 @@ from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.registry import ALGORITHMS
-from cfp.config import EVALUATION_SEED, RunConfig, to_words
+from cfp.config import EVALUATION_SEED, RunConfig, differences, to_words
 from cfp.errors import ConfigError
 from cfp.experiment.run import check_options
 from cfp.files import read_json, write_json
@@ -29,6 +29,19 @@ SAME_FOR_ALL = ("dt", "dtype", "resample", "substeps", "target", "variant")
 WITHOUT_INFLUENCE = ("backend", "checkpoint_every", "device", "log_every", "video")
 #: What a comparison keeps in the folder of a run: its options, its training time and its evaluation.
 RECORD = "comparison.json"
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """What `RECORD` in a folder holds; nothing before a comparison has begun the run there.
+
+    Raises:
+        ConfigError: It cannot be read.
+    """
+    path = folder / RECORD
+    try:
+        return read_json(path) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -58,12 +71,8 @@ class Run:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What `RECORD` holds; nothing before the run has begun. A `ConfigError` if it cannot be read."""
-        path = self.folder / RECORD
-        try:
-            return read_json(path) if path.exists() else {}
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path}: cannot be read ({error})") from error
+        """What `RECORD` holds, see `read_record`."""
+        return read_record(self.folder)
 
     def update_record(self, **values: Any) -> None:
         """Put values into the record."""
@@ -87,12 +96,10 @@ class Run:
             if (self.folder / "config.json").exists():
                 raise ConfigError(f"out: {self.folder} holds a run that no comparison has begun; name another --out")
             return
-        mine = json.loads(json.dumps(self.options))
-        for name in sorted({*mine, *there} - {*WITHOUT_INFLUENCE}):
-            if mine.get(name) != there.get(name):
+        for name, (old, new) in differences(there, json.loads(json.dumps(self.options))).items():
+            if name not in WITHOUT_INFLUENCE:
                 raise ConfigError(
-                    f"{name} must be {there.get(name)!r} as in the run in {self.folder}, got {mine.get(name)!r}; "
-                    "or name another --out"
+                    f"{name} must be {old!r} as in the run in {self.folder}, got {new!r}; or name another --out"
                 )
 
 

@@ -210,9 +210,8 @@ def draw(results: Sequence[Result], columns: int = 2) -> Figure:
 def write_report(folder: Path, results: Sequence[Result], first: str, protocol: Protocol) -> Path:
     """Write ``episodes.csv``, ``report.md``, ``index.html`` and its pictures; another process may do the same."""
     table, others = make_table(results, first, protocol), [each for each in results if each.state != "finished"]
-    state = f"{len(results) - len(others)} of {len(results)} runs are finished and evaluated{':' if others else '.'}"
-    if others:
-        state = state.replace(":", "; the others:")
+    end = "; the others:" if others else "."
+    state = f"{len(results) - len(others)} of {len(results)} runs are finished and evaluated{end}"
     lines = [f"{each.run.name}: {each.state}{f' ({each.run.error})' if each.run.error else ''}" for each in others]
     write_text(folder / "episodes.csv", csv_text(raw_rows(results), RAW), shared=True)
     with matplotlib.style.context("default"):  # not the user's own, which may need LaTeX

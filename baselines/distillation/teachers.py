@@ -14,7 +14,7 @@ from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
 from cfp.config import EnvironmentConfig
 from cfp.learner import Resumable
-from cfp.policy import Policy, StatePolicy, check_trained_for, read_policy
+from cfp.policy import Policy, attached, check_trained_for, read_policy
 from dittogym import TorchEnv
 from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
 
@@ -34,19 +34,19 @@ class Teacher(Resumable, ABC):
 class PolicyTeacher(Teacher):
     """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
-    def __init__(self, policy: Policy, indexing: ActionLayout) -> None:
-        self.policy, self.indexing = policy, indexing
+    def __init__(self, policy: Policy, action_layout: ActionLayout) -> None:
+        self.policy, self.action_layout = policy, action_layout
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """Mean actions (B, 2, R, R) of the policy."""
-        policy = self.policy.attached(env) if isinstance(self.policy, StatePolicy) else self.policy
+        policy = attached(self.policy, env)
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
-        own = trained_layout(self.policy) or self.indexing
-        return from_grid_layout(to_grid_layout(torch.as_tensor(array, device=env.device), own), self.indexing)
+        own = trained_layout(self.policy) or self.action_layout
+        return from_grid_layout(to_grid_layout(torch.as_tensor(array, device=env.device), own), self.action_layout)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""

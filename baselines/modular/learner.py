@@ -17,7 +17,7 @@ from cfp.errors import ConfigError, check_at_least, check_decay
 from cfp.learner import Sees
 from cfp.presets import sac_preset
 from cfp.sac.learner import SACLearner
-from cfp.sac.policies import NetworkPolicy
+from cfp.sac.policies import TwinCriticPolicy
 from dittogym import make_spec
 
 
@@ -87,7 +87,7 @@ class ModularConfig(LearningConfig, RunConfig):
             raise ConfigError(f"particles of the robot must be at least {self.segments}, one per segment, got {robot}")
 
 
-class ModularPolicy(NetworkPolicy):
+class ModularPolicy(TwinCriticPolicy):
     """Actor and critics over segments, for `cfp.CFP`; observes rows (K, columns) of `Nodes`."""
 
     def __init__(self, *arguments: Any, kind: Kind, features: int, **options: Any) -> None:
@@ -136,12 +136,6 @@ class Modular(SACLearner):
         """What has been learned so far; it must be attached to an environment."""
         description = {"resolution": self.config.resolution(self.stage)}
         return SegmentPolicy(cast(ModularActor, self.trained_actor), self.config.nodes, description)
-
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actor."""
-        policy = self.trained_policy
-        policy.description = description
-        policy.save(path)
 
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> SegmentPolicy:

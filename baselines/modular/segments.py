@@ -43,13 +43,13 @@ MAX_SEGMENTS = 4096
 BITS = 16
 
 
-def fit(x: Tensor, count: int, seed: int = 0) -> Tensor:
+def fit(x: Tensor, count: int) -> Tensor:
     """Segment particles (B, N, 2), m, from scratch by scikit-learn's k-means; returns labels (B, N), int64."""
     from sklearn.cluster import KMeans  # takes a second to import, which other algorithms need not wait for
 
     if x.shape[1] < count:
         raise ConfigError(f"particles of the robot must be at least {count}, one per segment, got {x.shape[1]}")
-    kmeans = KMeans(count, n_init=1, random_state=seed)
+    kmeans = KMeans(count, n_init=1, random_state=0)
     labels = [kmeans.fit(each).labels_ for each in x.double().cpu().numpy()]
     return torch.from_numpy(np.stack(labels).astype(np.int64)).to(x.device)
 

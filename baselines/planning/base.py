@@ -130,8 +130,8 @@ class Planner(Resumable, ABC, Generic[Config]):
         return smooth, value
 
     def _returns(self, state: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
-        indexing = self.env.action_layout
-        steps = rollout(self.env.model, state, plan, self._penalised, indexing=indexing, checkpointed=False)
+        layout = self.env.action_layout
+        steps = rollout(self.env.model, state, plan, self._penalised, action_layout=layout, checkpointed=False)
         total = steps.true_rewards.sum(0)
         charged = min(self.config.termination_steps, max(self._remaining_steps(state) - len(plan), 0))
         charge = torch.where(steps.ended, charged / len(plan) * total.clamp_min(0.0), 0.0)

@@ -1,4 +1,1 @@
-"""The method: networks, actors, losses, soft actor-critic.
-
-Imports nothing of `cfp.envs`, `cfp.evaluation` or `cfp.experiment`.
-"""
+"""The networks of the coarse-to-fine policy, and the actions that they choose."""

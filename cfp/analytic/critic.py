@@ -40,6 +40,7 @@ class StateFeatures:
     over the raster, so every particle count gives the same picture. The features are differentiable in the particles.
     """
 
+    # Trainings have both; there are files of policies without one of them.
     deformation: bool = True  # the four channels of F - I
     clock: bool = True  # cosine and sine of the episode's step, for each of `PERIODS`
     displacement: bool = False  # of the robot since the reset, m

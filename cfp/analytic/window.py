@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfp.config import EVALUATION_SEED, WindowConfig
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import TorchVecEnv, first_limits
+from cfp.envs.vec_env import DIVERGED, TorchVecEnv, first_limits
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.learner import Resumable
 from dittogym import TorchEnv, core
@@ -47,8 +47,6 @@ RADIUS = 0.03
 TOLERANCE = 0.25
 #: Memory for the gradients of a window on a GPU, with what going back through it needs, in what its steps keep.
 BACKWARD = 1.25
-#: What is wrong with actions that are not finite.
-DIVERGED = "the actor's actions became NaN or infinite"
 
 
 # The training reward.

@@ -1,1 +1,1 @@
-"""Environments of a run for stable-baselines3. Imports no networks."""
+"""Environments of a run for stable-baselines3."""

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import islice
 from threading import Event, Lock
 from typing import Any, Literal, NamedTuple
 
@@ -25,7 +26,7 @@ from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import DIVERGED
 from cfp.errors import NonFiniteError
 from cfp.messages import progress_bar
-from cfp.policy import Memory, Observation, Policy, Start, StatePolicy
+from cfp.policy import Memory, Observation, Policy, Start, attached
 from dittogym import Conditions, TorchEnv
 from dittogym.copies import to_device, to_host
 from dittogym.env import as_numpy
@@ -93,11 +94,6 @@ class UntrainedPolicy:
 
 
 # Playing episodes.
-
-
-def attached(policy: PolicyPredictor, env: TorchEnv) -> PolicyPredictor:
-    """A policy for an environment: shown the state if it acts on that."""
-    return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 
 
 class SeededPolicy:
@@ -227,56 +223,6 @@ class EpisodesStopped(Exception):
     """Another episode failed, or the program is being stopped."""
 
 
-def play(
-    trials: Sequence[Trial],
-    steps: int | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
-    name: str = "evaluation",
-) -> list[list[Played]]:
-    """Play the episodes of all trials, those of each in the order of their layouts.
-
-    Args:
-        trials: What to play.
-        steps: Steps of an episode at most, to show a progress bar; None shows none.
-        should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
-        name: What the progress bar is called.
-    """
-    spans = [(trial, *span) for trial in trials for span in trial.spans()]
-    threads, stop = torch.get_num_threads(), Event()
-    # On a GPU one at a time: nobody may draw random numbers while an environment records its operations.
-    workers = 1 if any(trial.together for trial in trials) else min(threads, len(spans))
-    total = (steps or 0) * sum(trial.episodes for trial in trials)
-    # Beside the bar of a training (leave=None) it vanishes at the end.
-    bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))
-
-    def play_span(trial: Trial, first: int, count: int) -> list[Played]:
-        taken = 0
-
-        def before_step() -> None:
-            nonlocal taken
-            if stop.is_set() or should_stop():
-                raise EpisodesStopped
-            taken += count
-            bar.update(count)
-
-        torch.set_num_threads(1)
-        episodes = trial.play(first, count, before_step)
-        bar.update((steps or 0) * count - taken)
-        return episodes
-
-    with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:
-        futures = [pool.submit(play_span, *span) for span in spans]
-        try:
-            for future in wait(futures, return_when=FIRST_EXCEPTION).done:
-                future.result()
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-            torch.set_num_threads(threads)
-    played = iter(futures)
-    return [[episode for _ in trial.spans() for episode in next(played).result()] for trial in trials]
-
-
 # Their returns.
 
 
@@ -368,8 +314,40 @@ def evaluate(
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
         name: What the progress bar is called.
     """
-    played = zip(trials, play(trials, steps, should_stop, name), strict=True)
-    return [Result(trial.name, trial.resolution, tuple(episodes)) for trial, episodes in played]
+    spans = [(trial, *span) for trial in trials for span in trial.spans()]
+    threads, stop = torch.get_num_threads(), Event()
+    # On a GPU one at a time: nobody may draw random numbers while an environment records its operations.
+    workers = 1 if any(trial.together for trial in trials) else min(threads, len(spans))
+    total = (steps or 0) * sum(trial.episodes for trial in trials)
+    # Beside the bar of a training (leave=None) it vanishes at the end.
+    bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))
+
+    def play_span(trial: Trial, first: int, count: int) -> list[Played]:
+        taken = 0
+
+        def before_step() -> None:
+            nonlocal taken
+            if stop.is_set() or should_stop():
+                raise EpisodesStopped
+            taken += count
+            bar.update(count)
+
+        torch.set_num_threads(1)
+        episodes = trial.play(first, count, before_step)
+        bar.update((steps or 0) * count - taken)
+        return episodes
+
+    with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:
+        futures = [pool.submit(play_span, *span) for span in spans]
+        try:
+            for future in wait(futures, return_when=FIRST_EXCEPTION).done:
+                future.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(threads)
+    played = (episode for future in futures for episode in future.result())
+    return [Result(trial.name, trial.resolution, tuple(islice(played, trial.episodes))) for trial in trials]
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
@@ -393,25 +371,22 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
 def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Results as JSON values."""
     return [
-        {"policy": result.name, "action": f"{result.resolution}x{result.resolution}", **numbers(result)}
+        {
+            "policy": result.name,
+            "action": f"{result.resolution}x{result.resolution}",
+            "episodes": len(result.returns),
+            "mean": round(result.mean, 3),
+            "std": round(result.std, 3),
+            "interval": None if result.interval is None else round(result.interval, 3),
+            "returns": [round(value, 3) for value in result.returns],
+            "success": result.success,
+            "success_whole": result.success_whole,
+            "torn": result.torn,
+            "piece": round(result.piece, 4),
+            "mean_piece": round(result.mean_piece, 4),
+        }
         for result in results
     ]
-
-
-def numbers(result: Result) -> dict[str, Any]:
-    """Numbers of a result as JSON values."""
-    return {
-        "episodes": len(result.returns),
-        "mean": round(result.mean, 3),
-        "std": round(result.std, 3),
-        "interval": None if result.interval is None else round(result.interval, 3),
-        "returns": [round(value, 3) for value in result.returns],
-        "success": result.success,
-        "success_whole": result.success_whole,
-        "torn": result.torn,
-        "piece": round(result.piece, 4),
-        "mean_piece": round(result.mean_piece, 4),
-    }
 
 
 def format_table(config: RunConfig, results: Sequence[Result]) -> str:

@@ -11,9 +11,9 @@ import numpy as np
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.evaluation.returns import Noise, SeededPolicy, attached, evaluation_seed, without_noise
+from cfp.evaluation.returns import Noise, SeededPolicy, evaluation_seed, without_noise
 from cfp.messages import say
-from cfp.policy import Policy
+from cfp.policy import Policy, attached
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
 from dittogym.render.recording import OPTIONS, Act, FilmOptions, Recording, record
@@ -36,12 +36,11 @@ def record_episode(
 ) -> Recorded:
     """One episode of a policy."""
     env = make_torch_env(config, policy.resolution, 1)
-    acting, memory, start = SeededPolicy(attached(policy, env), seed), None, np.array([True])
+    acting, memory = SeededPolicy(attached(policy, env), seed), None
 
     def act(observation: np.ndarray) -> np.ndarray:
-        nonlocal memory, start
-        action, memory = acting.predict(observation, memory, start, deterministic)
-        start = np.array([False])
+        nonlocal memory
+        action, memory = acting.predict(observation, memory, deterministic=deterministic)
         return action
 
     return recorder(env, act, seed)

@@ -22,14 +22,13 @@ from cfp.config import RunConfig, differences, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically
 from cfp.learner import Learner
+from cfp.sac.replay import FIELDS
 from dittogym.trajectories import ZIP_ERRORS
 
 VERSION = 3
 #: What torch raises for damaged files, besides ``pickle.UnpicklingError``.
 UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
 
-#: Arrays of a replay buffer that are stored.
-FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 #: Transitions in a chunk at most, so that several threads can write what a GPU has collected.
 LARGEST_CHUNK = 2**15
 #: These threads; each copies a chunk from the GPU.

@@ -18,24 +18,16 @@ from cfp.files import read_json
 from cfp.policy import read_policy
 
 
-def parse_folder(words: list[str]) -> Path:
-    """The folder that an option names; a ``ValueError`` if it cannot be the name of one."""
-    word = words[0]
-    if not word:  # a shell's variable that is not set; it would stand for the current folder
-        raise ValueError("must name a folder, got ''")
+def parse_folder(option: str, given: Any) -> Path:
+    """The folder that an option names; a `ConfigError` if it cannot be the name of one."""
+    if not isinstance(given, str | os.PathLike) or not str(given):
+        # An empty word, from a shell's variable that is not set, would stand for the current folder.
+        raise ConfigError(f"{option} must name a folder, got {given!r}")
     try:
-        word.encode()
+        str(given).encode()
     except UnicodeEncodeError as error:
-        raise ValueError(f"must be text in UTF-8, got {word!r}") from error
-    return Path(word)
-
-
-def folder_option(words: list[str]) -> Path:
-    """The folder that ``--out`` names; a `ConfigError` if it cannot be the name of one."""
-    try:
-        return parse_folder(words)
-    except ValueError as error:  # which tyro would bury under its own words
-        raise ConfigError(f"out {error}") from error
+        raise ConfigError(f"{option} must be text in UTF-8, got {given!r}") from error
+    return Path(given)
 
 
 #: A folder to write into, as an option of a command line.
@@ -44,7 +36,7 @@ Folder = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=folder_option,
+        instance_from_str=lambda words: parse_folder("out", words[0]),
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda folder: [str(folder)],
     ),
@@ -102,7 +94,7 @@ class FolderInUse(CFPError):
 
 
 @contextmanager
-def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
+def run_lock(folder: Path) -> Iterator[None]:
     """Hold the folder of a run, which is created if need be; the system releases it however the process ends."""
     is_new = not folder.exists()
     try:
@@ -111,7 +103,7 @@ def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
         raise ConfigError(f"out: {folder} cannot be created as a folder ({error.strerror})") from error
     path = folder / ".lock"
     try:
-        lock = FileLock(path).acquire(timeout=timeout)
+        lock = FileLock(path).acquire(timeout=0)
     except Timeout:
         owner = path.read_text().strip() if path.exists() else ""
         raise FolderInUse(f"out: {folder} is in use by {owner or 'another process'}") from None

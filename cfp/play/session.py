@@ -17,6 +17,7 @@ from torch import Tensor
 
 from cfp.play import protocol
 from cfp.play.hand import Direction, Grip, press, reach, wave
+from cfp.policy import attached
 from dittogym.action import bicubic, from_grid_layout, patch_corner, to_grid_layout, trained_layout
 from dittogym.bodies.drawings import with_body
 from dittogym.bodies.positions import probe
@@ -314,7 +315,7 @@ class Session:
             env = TorchEnv(self.task, 1, **{**self.options, "resolution": resolution})
             env.reset(seed=self.seed, options={"physics": self.physics})
             env.env_state = self.env.env_state
-        self.policy = policy.attached(env) if hasattr(policy, "attached") else policy
+        self.policy = attached(policy, env)
         if env is not self.env:
             self.env = env
             self.action = self.painted = np.zeros(env.action_shape, np.float32)
@@ -362,6 +363,7 @@ class Session:
             raise ValueError("there is no moment to go back to: save one first")
         snapshot, history = self.saved
         self.history, self.seed = history.copy(), history.seed  # what came after it did not happen
+        self.rows.clear()
         self.observation, state = self.env.load(snapshot), self.env.env_state
         values, then = physics_values(self.physics, self.env.num_particles, state.centre[:, 0]), state.physics
         self.env.env_state = replace(state, physics=values)

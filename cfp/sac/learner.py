@@ -37,7 +37,7 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation.page import policy_pictures
 from cfp.learner import AveragedWeights, CoarseToFine, Learner, generator_state, refines, restore_generator
 from cfp.presets import sac_preset
-from cfp.sac.policies import CFPPolicy, NetworkPolicy, TwinCritic
+from cfp.sac.policies import CFPPolicy, TwinCritic, TwinCriticPolicy
 from cfp.sac.replay import Composition, ReplayRing
 from dittogym.copies import to_device
 
@@ -215,7 +215,7 @@ class CFP(SAC):
     is logged and before anything is saved.
 
     Args:
-        policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.NetworkPolicy``.
+        policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.TwinCriticPolicy``.
         env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
         hyperparameters: Hyperparameters of the stage.
         sac_options: Further options of stable-baselines3's SAC, such as ``policy_kwargs``, ``seed`` and ``device``.
@@ -236,7 +236,7 @@ class CFP(SAC):
 
     def __init__(
         self,
-        policy: str | type[NetworkPolicy],
+        policy: str | type[TwinCriticPolicy],
         env: GymEnv | str,
         hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
         **sac_options: Any,
@@ -296,7 +296,7 @@ class CFP(SAC):
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics."""
-        assert isinstance(self.policy, NetworkPolicy)
+        assert isinstance(self.policy, TwinCriticPolicy)
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -343,7 +343,7 @@ class CFP(SAC):
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
-        assert isinstance(self.policy, NetworkPolicy)
+        assert isinstance(self.policy, TwinCriticPolicy)
         actor, critic, target = self.networks()
         obs = self.policy.encode(batch.observations)
         if not self.trains_encoder:
@@ -570,7 +570,7 @@ class SACLearner(CFP, Learner):
 
     @classmethod
     def make(
-        cls, config: Any, stage: int, folder: Path, env: VecMonitor, policy: type[NetworkPolicy], networks: Any
+        cls, config: Any, stage: int, folder: Path, env: VecMonitor, policy: type[TwinCriticPolicy], networks: Any
     ) -> SACLearner:
         """The learner at the beginning of a stage, with a policy that has ``networks`` as its options."""
         options = {"policy_kwargs": networks, "seed": config.seed, "stats_window_size": max(10, env.num_envs)}

@@ -112,7 +112,7 @@ def _values(perceptrons: Iterable[nn.Module], latents: Tensor) -> tuple[Tensor, 
     return tuple(values)
 
 
-class NetworkPolicy(sac_policies.SACPolicy, ABC):
+class TwinCriticPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.CFP` trains; subclasses create actor and critics.
 
     Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
@@ -169,7 +169,7 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
 
 
-class CFPPolicy(NetworkPolicy):
+class CFPPolicy(TwinCriticPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     The actors of coarser stages are frozen submodules of the actor, so ``state_dict`` and ``predict`` cover all stages.
@@ -178,9 +178,9 @@ class CFPPolicy(NetworkPolicy):
     Args:
         observation_space: uint8 (3, 64, 64).
         action_space: float32 (2, R, R) in [-1, 1].
-        lr_schedule: See `NetworkPolicy`.
+        lr_schedule: See `TwinCriticPolicy`.
         spec: Structure of the actor; None: a plain actor of the action space's resolution.
-        options: See `NetworkPolicy`.
+        options: See `TwinCriticPolicy`.
 
     Raises:
         ValueError: The actions of ``spec`` do not have the shape of the action space, or ``use_sde`` is set.

@@ -105,9 +105,14 @@ def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path):
     assert returns == pytest.approx([rest("obstacle", 0, count) for count in (100, 90)], abs=1e-2)
 
 
-def test_policies_of_other_tasks_are_refused(tmp_path, capsys):
+def test_policies_of_other_tasks_and_damaged_records_are_refused(tmp_path, capsys):
     config = preset("shapematch", "quick")
-    for changes, expected in (({"target": "T"}, "target of the task, got T"), ({"substeps": 50}, "got 0.005")):
+    (tmp_path / "comparison.json").write_text("{")
+    for changes, expected in (
+        ({"target": "T"}, "target of the task, got T"),
+        ({"substeps": 50}, "got 0.005"),
+        ({}, "comparison.json: cannot be read"),
+    ):
         there = replace(config, **changes)
         save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
         assert main([str(tmp_path / "a.safetensors"), "--out", str(tmp_path / "out")]) == 2

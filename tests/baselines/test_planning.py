@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from updates import learn
+from watching import learn
 
 from baselines import CEMPlanner, CEMPlannerConfig, GradientPlanner, GradientPlannerConfig
 from baselines.common.rollout import rollout, soft_step

@@ -9,6 +9,7 @@ import pytest
 import torch
 from policy_files import save_actor
 from stable_baselines3.common.callbacks import BaseCallback
+from watching import at_step, interrupt
 
 import baselines
 import dittogym
@@ -19,7 +20,7 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.callbacks import EvaluationCallback
-from cfp.policy import StatePolicy, describe_run, read_policy
+from cfp.policy import attached, describe_run, read_policy
 from cfp.presets import sac_preset
 from cfp.tables import read_table
 
@@ -111,10 +112,9 @@ def test_run_leaves_its_files(finished):
 def test_policy_is_loaded_by_its_kind_and_evaluated(finished, tmp_path, capsys):
     algo, folder = finished
     images, policy = np.zeros((3, 3, 64, 64), np.uint8), baselines.load(folder)
-    if isinstance(policy, StatePolicy):
-        env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
-        env.reset(seed=0)
-        policy = policy.attached(env)
+    env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
+    env.reset(seed=0)
+    policy = attached(policy, env)
     actions, _ = policy.predict(images, None, np.ones(3, bool), True)
     assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
     size = 64 if algo.startswith(("gnn", "transformer")) else 8
@@ -127,13 +127,12 @@ def test_policy_is_loaded_by_its_kind_and_evaluated(finished, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("finished", algorithms(slow=LARGE | ALIKE), indirect=True)
-def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
+def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, capsys):
     algo, whole = finished
     folder = tmp_path / "stopped"
-    stop_at(TINY[algo][1])
-    assert run(algo, folder) == 128 + signal.SIGINT
+    with at_step(TINY[algo][1], interrupt):
+        assert run(algo, folder) == 128 + signal.SIGINT
     assert "python -m baselines.train --resume" in capsys.readouterr().out
-    monkeypatch.undo()
     assert train.main(["--out", str(folder), "--resume"]) == 0
     for name in ("results.json", "evaluations.csv"):
         assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
@@ -195,16 +194,15 @@ def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeyp
     assert len(baselines.load(tmp_path).actions) == json.loads((tmp_path / "policy.json").read_text())["steps"] == 8
 
 
-def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
+def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path):
     """Also if the run goes on when the policy is no longer there."""
     config = configure({"algo": "coarse", "resolutions": [8], "substeps": 1, "encoder": "paper"})
     start = tmp_path / "start.safetensors"
     save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)
     words = ["--refine", "--start-from", str(start), "--resolutions", "8", "--steps", "24", "--eval-every", "24"]
-    stop_at(12)
-    assert run("cfp-analytic", tmp_path / "run", *words, "--warmup", "0") == 128 + signal.SIGINT
+    with at_step(12, interrupt):
+        assert run("cfp-analytic", tmp_path / "run", *words, "--warmup", "0") == 128 + signal.SIGINT
     assert baselines.load(tmp_path / "run").description["steps"] == 0
-    monkeypatch.undo()
     start.unlink()
     assert train.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
     rows = read_table(tmp_path / "run" / "evaluations.csv")

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from watching import learn
 
 import cfp
 import dittogym
@@ -28,37 +27,9 @@ def make(task="run", stages=1, **changes):
     return replace(cfp.preset(task, "quick", "cfp-analytic"), **options | changes)
 
 
-class Rows(BaseCallback):
-    """Keeps what is recorded by each update."""
-
-    def __init__(self):
-        super().__init__()
-        self.rows, self.window = [], False
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_start(self):
-        if self.window:
-            self.rows.append(dict(self.logger.name_to_value))
-        self.window = True
-
-    def _on_training_end(self):
-        self._on_rollout_start()
-
-
 def update(learner, count=1):
     """Make some updates; returns what each records."""
-    rows = Rows()
-    steps = count * learner.config.update_every
-    learner.learn(steps, rows, log_interval=None, reset_num_timesteps=False)
-    return rows.rows
-
-
-def create(config, folder, stage=1):
-    learner = CFPAnalytic.create(config, stage, folder)
-    learner.set_logger(Logger(None, []))
-    return learner
+    return learn(learner, count * learner.config.update_every)
 
 
 def counting(transition, spec):
@@ -82,7 +53,7 @@ def without_derivative(transition, spec):
 def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path):
     spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=without_derivative, weights={"far": 1.0})
     monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
-    learner = create(replace(make(reward="task"), task="nan"), tmp_path)
+    learner = CFPAnalytic.create(replace(make(reward="task"), task="nan"), 1, tmp_path)
     with pytest.warns(UserWarning, match="most gradients of a window are not finite"):
         update(learner, 9)
     with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row"):
@@ -91,7 +62,7 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path)
 
 def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
     for train_dt, expected in ((2e-4, (2e-4, 2)), (None, (1e-4, 4))):
-        model = create(make(train_dt=train_dt), tmp_path).simulation.model
+        model = CFPAnalytic.create(make(train_dt=train_dt), 1, tmp_path).simulation.model
         assert (model.solver.dt, model.substeps) == expected
 
 
@@ -108,7 +79,7 @@ def parameters(module):
 def test_training_shapes_the_robot(tmp_path):
     config = make("shapematch", resolutions=(8,), window=16, steps=448, max_episode_steps=48, num_layouts=2)
     config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=16, windows_kept=4, substeps=None)
-    rows = update(create(config, tmp_path), 14)
+    rows = update(CFPAnalytic.create(config, 1, tmp_path), 14)
     assert set(rows[-1]) == set(METRICS)
     rewards = [row["train/true_reward"] for row in rows]
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.8  # 1.2 to 1.4 with three seeds
@@ -116,8 +87,8 @@ def test_training_shapes_the_robot(tmp_path):
 
 @pytest.mark.cuda
 def test_trains_on_cuda_and_goes_on_on_the_cpu(tmp_path):
-    config = make("shapematch", device="cuda")
-    learner, there = create(config, tmp_path), create(replace(config, device="cpu"), tmp_path)
+    config = make("shapematch")
+    learner, there = (CFPAnalytic.create(replace(config, device=name), 1, tmp_path) for name in ("cuda", "cpu"))
     update(learner)
     there.load_state_dict(learner.state_dict())
     assert np.isfinite(update(there)[0]["train/reward"])
@@ -179,7 +150,7 @@ def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation():
 
 
 def test_rates_fall_along_a_line(tmp_path):
-    learner = create(make(), tmp_path)
+    learner = CFPAnalytic.create(make(), 1, tmp_path)
     config = learner.config
     learner.num_timesteps = config.steps // 2
     scalars = update(learner)[0]
@@ -188,10 +159,10 @@ def test_rates_fall_along_a_line(tmp_path):
 
 
 def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):
-    first = create(make(), tmp_path)
+    first = CFPAnalytic.create(make(), 1, tmp_path)
     update(first, 2)
     first.save_policy(policy_path(tmp_path, 1), describe_run(first.config, "cfp", 1, 16))
-    second = create(make(stages=2), tmp_path, 2)
+    second = CFPAnalytic.create(make(stages=2), 2, tmp_path)
     coarse, gate = (second.actor.get_submodule(name) for name in ("coarse", "gate"))
     assert second.starts_trained and torch.equal(parameters(coarse), parameters(first.trained_actor))
     before = parameters(gate)
@@ -206,7 +177,7 @@ def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):
 def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
     """The step on the actions, were it small, increases the return of the same window."""
     config = make(substeps=100, gamma=1.0, num_envs=1)
-    learner = create(config, tmp_path)
+    learner = CFPAnalytic.create(config, 1, tmp_path)
     env, collector = learner.simulation, learner.collector
     start = env.save()
     leaf = torch.randn(4, 1, *env.action_shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
@@ -225,7 +196,7 @@ def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
 
 
 def test_a_trained_policy_is_kept_until_the_critic_has_learned(tmp_path):
-    learner = create(make(warmup=2), tmp_path)
+    learner = CFPAnalytic.create(make(warmup=2), 1, tmp_path)
     learner.starts_trained = True
     before, critic = parameters(learner.actor), parameters(learner.critic.network)
     update(learner, 2)

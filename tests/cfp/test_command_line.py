@@ -5,7 +5,6 @@ import io
 import json
 import os
 import re
-import shlex
 import signal
 import sys
 from dataclasses import replace
@@ -65,15 +64,6 @@ def test_help_shows_each_option_once_with_its_description_and_the_task_s_own_val
             told = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
             assert f"(default: {told})" in entry
     assert "Algorithms: cfp-analytic, cfp-sac" in shown
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [("--learner sac --algo cfp-analytic", "learner"), ("--algo ppo", "algo"), ("--out ''", "out"), ("--out=", "out")],
-)
-def test_word_that_cannot_be_used_is_named_in_one_line(words, named, capsys):
-    assert train.main(shlex.split(words)) == 2
-    assert re.fullmatch(rf"error: {named} must .*\n", capsys.readouterr().err)
 
 
 def test_help_names_the_program_that_was_started(monkeypatch, capsys):

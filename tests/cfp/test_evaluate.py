@@ -11,10 +11,10 @@ from fakes import FakeEnv
 
 from cfp import messages
 from cfp.errors import ConfigError
-from cfp.evaluate import Selection
+from cfp.evaluate import Command
 from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
 from cfp.presets import preset
-from dittogym import Conditions, TorchEnv
+from dittogym import Conditions
 
 
 class LinearPolicy:
@@ -44,12 +44,6 @@ class Counting:
         return np.zeros((len(observation), 2, 8, 8), np.float32), state
 
 
-def tiny(task="run", **environment):
-    config = preset(task)
-    options = {"particles": 200, "substeps": 2} | environment
-    return replace(config, device="cpu", **options)
-
-
 def fake_trial(policy, episodes, together=False, **options):
     def make_env(count):
         return Layouts(count, **{"horizon": 4} | options)
@@ -64,26 +58,13 @@ class Layouts(FakeEnv):
         return super().reset(seed=None if seed is None else 10 * seed, options=options)
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Episodes of every task that last a few steps."""
-    monkeypatch.setattr(TorchEnv, "step", _ending(TorchEnv.step))
-
-
-def _ending(step):
-    def shortened(self, action, **options):
-        observation, reward, terminated, truncated, info = step(self, action, **options)
-        return observation, reward, terminated, truncated | (self.env_state.steps >= 6), info
-
-    return shortened
-
-
 @pytest.mark.parametrize(
     ("threads", "conditions"),
     [(2, None), (3, Conditions(shift=0.01, turn=5.0, velocity=0.05, action_noise=0.2, observation_dropout=0.2))],
 )
 def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads, conditions):
-    config, before = tiny(), torch.get_num_threads()
+    config = replace(preset("shapematch"), device="cpu", particles=200, substeps=2)
+    before = torch.get_num_threads()
     options = {"deterministic": False, "seed": 5, "conditions": conditions}
     trial = make_trial(config, "", LinearPolicy(), 4, **options)
     state = torch.get_rng_state()
@@ -170,11 +151,12 @@ def test_an_episode_that_fails_ends_the_others():
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():
-    config, _ = Selection(policy="run", dt=2e-4).open()
+    config, _ = Command(policy="run", dt=2e-4).open()
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
-    with pytest.raises(ConfigError, match="dt must divide"):
-        Selection(policy="run", dt=3e-4).open()
+    for dt, message in ((3e-4, "dt must divide an environment step"), (0.0, "dt must be positive")):
+        with pytest.raises(ConfigError, match=f"^{message}"):
+            Command(policy="run", dt=dt).open()
 
 
 def test_the_seed_chooses_the_episodes():
-    assert [Selection(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]
+    assert [Command(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]

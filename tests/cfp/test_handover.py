@@ -38,7 +38,7 @@ def test_second_stage_starts_from_a_policy(coarse, tmp_path):
     assert [row["policy"] for row in results][2:] == ["stage 1", "stage 2"]
 
 
-def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
+def test_second_stage_begins_with_the_small_encoder_of_the_first(tmp_path):
     for encoder in ("small", "paper"):
         config = sac_preset("run")
         config = replace(config, encoder=encoder)

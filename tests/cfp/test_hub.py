@@ -13,7 +13,7 @@ import baselines
 import cfp
 from cfp import hub
 from cfp.agent.actor import ActorSpec
-from cfp.evaluate import Selection
+from cfp.evaluate import Command
 from cfp.policy import ActorPolicy
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
@@ -99,7 +99,7 @@ def test_policies_of_other_algorithms_and_programs_take_addresses(server, policy
     wave.push(REPO)
     assert "baselines.load(" in (server.commits[-1] / "README.md").read_text()
     assert torch.equal(baselines.load(f"hf://{REPO}").actions, wave.actions)
-    config, policies = Selection(policy=policy.push(REPO)).open()
+    config, policies = Command(policy=policy.push(REPO)).open()
     assert config.task == "kick" and same(policies["policy"], policy)
 
 

@@ -10,7 +10,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,13 +30,14 @@ from cfp.play.session import Session
 from cfp.policy import describe_run
 
 SMALL: dict[str, Any] = {"particles": 200, "substeps": 10}
+run = partial(Session, "run", **SMALL)
 MALFORMED = ["", "null", '{"type": "play"}', '{"type": "policy", "name": "../../etc/passwd"}']
 
 
 @contextlib.contextmanager
-def serve(root_path: str = "") -> Iterator[Server]:
+def serve(root_path: str = "", new_session: Callable[[], Session] = run) -> Iterator[Server]:
     """A server on a free port, in a thread."""
-    server = Server(partial(Session, "run", **SMALL), "secret", port=0, root_path=root_path)
+    server = Server(new_session, "secret", port=0, root_path=root_path)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
@@ -50,7 +51,7 @@ def serve(root_path: str = "") -> Iterator[Server]:
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
     """A server; the kernels are compiled before pages wait for pictures."""
-    Session("run", **SMALL).advance()
+    run().advance()
     with serve() as server:
         yield server
 
@@ -161,18 +162,13 @@ def test_malformed_messages_are_answered_and_survived(server: Server) -> None:
 
 
 def test_a_page_sees_that_time_has_stopped_after_an_error() -> None:
-    session = Session("run", **SMALL)
+    session = run()
     session.advance()  # compiles the kernels
     session.policy = object()  # which cannot act
-    server = Server(lambda: session, "secret", port=0)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    with open_page(server) as page:
+    with serve(new_session=lambda: session) as server, open_page(server) as page:
         receive(page, "error")
         number, *_, flags = HEAD.unpack_from(page.recv(timeout=60))[:4]
         assert number and not flags & 1
-    server.stop()
-    thread.join(10)
 
 
 def test_time_stops_and_goes_on_in_single_steps(server: Server) -> None:

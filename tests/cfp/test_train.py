@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_runs import OF_LEARNER, ONE_STAGE, TABLES, assert_same_run, at_step, resume, run
+from tiny_runs import OF_LEARNER, ONE_STAGE, TABLES, assert_same_run, resume, run
+from watching import at_step, interrupt
 
 from cfp import evaluate, registry
 from cfp.config import to_json
@@ -28,10 +29,6 @@ from dittogym.tasks.targets import load_target
 pytestmark = pytest.mark.usefixtures("short")
 
 SHORT = "--steps 40 --handover 0.5 --eval-every 0 --eval-episodes 1".split()
-
-
-def interrupt():
-    signal.raise_signal(signal.SIGINT)
 
 
 def terminate():

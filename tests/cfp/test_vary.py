@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_runs import ONE_STAGE, assert_same_run, at_step, resume, run
+from tiny_runs import ONE_STAGE, assert_same_run, resume, run
+from watching import at_step, interrupt
 
 import cfp
 from cfp.analytic.window import Episodes
@@ -29,7 +30,7 @@ def test_a_varied_training_goes_on_as_if_nothing_had_happened(learner, tmp_path)
     options = [*ONE[learner], "--steps", "48"]
     varied = [*options, "--vary", "0.9"]
     assert run(tmp_path / "whole", *varied, learner=learner) == 0
-    with at_step(24, lambda: signal.raise_signal(signal.SIGINT)):
+    with at_step(24, interrupt):
         assert run(tmp_path / "stopped", *varied, learner=learner) == 128 + signal.SIGINT
     assert resume(tmp_path / "stopped") == 0
     assert_same_run(tmp_path / "stopped", tmp_path / "whole", LEFT)

@@ -1,11 +1,6 @@
 """Trainings of seconds: robots of a hundred particles that move one substep at a time."""
 
-from contextlib import contextmanager
-
-import pytest
-
 from cfp import train
-from cfp.experiment.callbacks import StopCallback
 
 COMMON = (
     "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
@@ -36,18 +31,3 @@ def resume(folder, *more):
 def assert_same_run(folder, other, tables=(*TABLES, "policy.safetensors")):
     for name in tables:
         assert (folder / name).read_bytes() == (other / name).read_bytes(), name
-
-
-@contextmanager
-def at_step(step, action):
-    """Do something at a step of the run, after everything else that is done there."""
-    on_step = StopCallback._on_step
-
-    def act(callback):
-        if callback.stage.step == step:
-            action()
-        return on_step(callback)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(StopCallback, "_on_step", act)
-        yield

@@ -1,7 +1,13 @@
-"""Watching an algorithm learn."""
+"""Watching a training, and interrupting it."""
 
+import signal
+from contextlib import contextmanager
+
+import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+
+from cfp.experiment.callbacks import StopCallback
 
 
 class _Rows(BaseCallback):
@@ -27,3 +33,23 @@ def learn(learner, steps):
     learner.set_logger(Logger(None, []))
     learner.learn(steps, callback, None, reset_num_timesteps=False)
     return callback.rows
+
+
+def interrupt():
+    """As Ctrl-C does."""
+    signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def at_step(step, action):
+    """Do something at a step of the run, after everything else that is done there."""
+    on_step = StopCallback._on_step
+
+    def act(callback):
+        if callback.stage.step == step:
+            action()
+        return on_step(callback)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StopCallback, "_on_step", act)
+        yield
