@@ -318,8 +318,12 @@ class Solver:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
 
     def _try_laws(self, state: ParticleState) -> None:
-        """Before the first step, call each material of somebody else once, to see whether it returns what it must."""
-        if not vars(self).get("_tried"):
+        """Before the first step, call each material of somebody else once, to see whether it returns what it must.
+
+        With gradients before every step: what a law saves that differentiates its energy is counted by a checkpoint
+        around the step, and has to be there again in the replay.
+        """
+        if torch.is_grad_enabled() or not vars(self).get("_tried"):
             components = [component.detach() for component in state.components()]
             for body, part in slices(self.bodies):
                 if type(body.material) not in KINDS:
