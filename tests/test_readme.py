@@ -77,6 +77,7 @@ PAGES = {
     "docs/concepts/planning.md": ("assert planner.num_plans > 0 and planner.num_failed == 0",),
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
+        "assert material.net[0].weight.grad.abs().max() > 0 and friction.grad < 0",
         "assert pull.grad.flatten(1).norm(dim=1).min() > 0",
         "assert policy.actions.shape == (30, 2, 32, 32) and (folder / 'index.html').exists()",
     ),

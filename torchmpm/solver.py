@@ -234,9 +234,15 @@ class Solver:
     def substep(self, scene: Scene, state: Components) -> Components:
         """One substep of a scene, from the components (B, N) of a ``state`` to new ones.
 
-        A subclass may compute it in another way.
+        A subclass may compute it in another way. It runs on the eager backend.
         """
         return substep(scene, state)
+
+    @property
+    def _replaced(self) -> str | None:
+        """The method with which a subclass computes something in another way, if it does."""
+        own = type(self)
+        return next((n for n in ("substep", "scene") if getattr(own, n) is not getattr(Solver, n)), None)
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
@@ -267,7 +273,7 @@ class Solver:
 
     def _reads_scene_alone(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a substep reads no tensors but those of the scene; custom materials and substeps may read others."""
-        if type(self).substep is not Solver.substep or torch.compiler.is_compiling():
+        if self._replaced or torch.compiler.is_compiling():
             return False
         return tree.is_open(self.bodies) and not self._has_tangents(state, *fields)
 
@@ -278,8 +284,8 @@ class Solver:
 
     def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
         """Why the kernels cannot run a step, or ``None`` if they can."""
-        if type(self).substep is not Solver.substep:
-            return f"it does not call {type(self).__name__}.substep"
+        if self._replaced:
+            return f"it does not call {type(self).__name__}.{self._replaced}"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
         if self._has_tangents(state, *fields):
@@ -287,7 +293,10 @@ class Solver:
         return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
-        """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked."""
+        """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked.
+
+        A subclass may change it, for example the friction of ``faces``. It runs on the eager backend.
+        """
         nodes = self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
@@ -318,8 +327,12 @@ class Solver:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
 
     def _try_laws(self, state: ParticleState) -> None:
-        """Before the first step, call each material of somebody else once, to see whether it returns what it must."""
-        if not vars(self).get("_tried"):
+        """Before the first step, call each material of somebody else once, to see whether it returns what it must.
+
+        With gradients before every step: what a law saves that differentiates its energy is counted by a checkpoint
+        around the step, and has to be there again in the replay.
+        """
+        if torch.is_grad_enabled() or not vars(self).get("_tried"):
             components = [component.detach() for component in state.components()]
             for body, part in slices(self.bodies):
                 if type(body.material) not in KINDS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from multiprocessing.reduction import ForkingPickler
 from numbers import Integral
 from typing import Any
 
@@ -189,3 +190,15 @@ class ParticleState:
 
 
 torch.serialization.add_safe_globals([ParticleState])  # its tensors are all that a file holds of it
+
+
+def _shared(state: ParticleState) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
+    """As :meth:`ParticleState.__reduce__`, for a process that is to share the memory of the fields.
+
+    That of copies would be freed before the process has opened it.
+    """
+    tree.refuse_graph("a ParticleState", state)
+    return ParticleState, tuple(getattr(state, field.name) for field in fields(state))
+
+
+ForkingPickler.register(ParticleState, _shared)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
-from torchmpm import Body, Grid, Solver, VelocityRule, VonMises, backends, trajectory, tree
+from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory, tree
 from torchmpm.backends import compiler_found
 from torchmpm.native import library
 from torchmpm.substep import Components, Scene
@@ -58,6 +58,19 @@ class Still(Solver):
         return state
 
 
+@dataclass(frozen=True, eq=False)
+class Slippery(Solver):
+    """Its rules have a friction that can be learned."""
+
+    friction: Tensor | float = 0.0
+
+    def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
+        """The same with other faces."""
+        scene = super().scene(state, actuation, origin)
+        faces = tuple(replace(face, friction=self.friction * face.active) for face in scene.faces)
+        return replace(scene, faces=faces)
+
+
 class Narrow(Grid):
     """Of its particles none takes part."""
 
@@ -78,6 +91,21 @@ def test_subclasses_are_heard(name: str, fresh_process: None, caplog: pytest.Log
         assert name in message
         with pytest.raises(ValueError, match=name):
             kind(grid, (body,), backend="native").step(state)
+
+
+@pytest.mark.parametrize("backend", ["auto", "eager"])
+def test_friction_that_a_subclass_learns(backend: str) -> None:
+    """Through checkpoints, too."""
+    friction = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    rule, found = VelocityRule("-y", j=(None, 8), friction=1.0), []
+    for segment in (None, 2):
+        solver = Slippery(
+            GRID, (Body(30, VonMises(500.0, 50.0, 60.0)),), rules=(rule,), backend=backend, friction=friction
+        )
+        final = solver.step(lively(30), substeps=5, segment=segment)
+        found += torch.autograd.grad(final.x.square().sum(), friction)
+    torch.testing.assert_close(*found)
+    assert found[0].abs() > 0
 
 
 def test_long_steps_go_through_torch_func() -> None:

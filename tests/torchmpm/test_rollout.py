@@ -12,7 +12,7 @@ from peak_memory import PeakMemory
 from scenes import lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, ParticleState, repeated, trajectory
+from torchmpm import Body, Elastic, ParticleState, Solver, repeated, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.materials.body import METHODS
 
@@ -254,6 +254,34 @@ def test_a_change_between_a_step_of_a_learned_law_and_its_gradient_is_refused(na
         getattr(law, name).mul_(0.5)
     with pytest.raises(RuntimeError, match=CHANGED):
         final.x.square().sum().backward()
+
+
+class Differentiated(Learned):
+    """A law that differentiates its energy itself."""
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        if method != "stress":
+            return super().call(method, *arguments)
+        F, Jp = arguments
+        with torch.enable_grad():
+            F = tuple(f if f.requires_grad else f.detach().requires_grad_() for f in F)
+            a, b, c, d = torch.autograd.grad(self.energy(F, Jp).sum(), F, create_graph=True)
+        return a * F[0] + b * F[1], a * F[2] + b * F[3], c * F[2] + d * F[3]
+
+
+@pytest.mark.parametrize("segment", [None, 2])
+def test_the_first_step_of_a_law_that_differentiates_its_energy_is_replayed(segment: int | None) -> None:
+    found = []
+    for law in (Learned(), Differentiated()):
+        solver = robot(5, bodies=(Body(5, law, mass=2.0),), backend="eager")
+
+        def step(state: ParticleState, _: int, solver: Solver = solver) -> ParticleState:
+            return solver.step(state, substeps=5, segment=segment)
+
+        final, _ = trajectory(step, lively(5), range(2), observe=lambda state: None)
+        final.x.square().sum().backward()
+        found.append(law.mu.grad)
+    torch.testing.assert_close(*found)
 
 
 @pytest.mark.parametrize("loop", ["step", "trajectory", "repeated"])

@@ -1,5 +1,6 @@
 """ParticleState: shapes, views on its planes, selection and branching."""
 
+import multiprocessing
 import pickle
 import subprocess
 import sys
@@ -154,3 +155,16 @@ def test_a_pickle_is_a_state_and_holds_its_numbers_alone() -> None:
     again = pickle.loads(pickle.dumps(state))
     again.v[..., 0] += 1.0
     assert torch.equal(again.stack()[2], state.v[..., 0] + 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_a_process_is_started_with_a_state(method: str) -> None:
+    """As the workers of a ``DataLoader`` are."""
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {method} here")
+    state = robot(5).step(lively(5), substeps=1)
+    process = multiprocessing.get_context(method).Process(target=repr, args=(state,))
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0

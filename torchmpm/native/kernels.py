@@ -205,7 +205,7 @@ def _sum_shared(bar: Tensor, values: Tensor, tables: Tables) -> Tensor:
         bar = bar.sum(1, keepdim=True)
     columns = []
     for body in tables.bodies[: tables.num_bodies]:
-        part = bar[:, :, body.first : body.first + body.count]
+        part = bar.narrow(2, body.first, body.count)
         columns.append(part if body.varying else part.sum(2, keepdim=True))
     return torch.cat(columns, dim=2)
 
