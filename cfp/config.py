@@ -76,7 +76,7 @@ class TaskConfig:
     algo: str
     """Name of the algorithm."""
     preset: Preset = "quick"
-    """Set of default options: quick (minutes), long (a night; soft actor-critic only), or paper (published values)."""
+    """Set of default options: quick (minutes), long (hours; soft actor-critic only), or paper (published values)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"

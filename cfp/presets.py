@@ -147,7 +147,7 @@ def preset(task: str, name: Preset = "quick", algo: str | None = None) -> SACCon
             has its own action grids, with ``"cfp-sac"`` the numbers of RUN, and no preset ``"paper"``.
         name: ``"paper"``: the published numbers, one robot with full particles, and the reference's interpolation.
             ``"quick"``: several robots with fewer particles, minutes instead of days. For ``"cfp-sac"`` also
-            ``"long"``, the same as ``"quick"`` for a night of eight hours on two cores.
+            ``"long"``, the same as ``"quick"`` with about ten times as many steps: one to five hours of a core.
         algo: ``"cfp-analytic"`` or ``"cfp-sac"``; by default ``"cfp-analytic"`` for ``"quick"``, and ``"cfp-sac"`` for
             the other presets, which have no other.
 
@@ -228,7 +228,7 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
     task, quick = paper.task, name == "quick"
     horizon, many = dittogym.make_spec(task).horizon, task in MANY_UPDATES
     # a longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone
-    steps = (48_000 if many else 38_400) if quick else (819_200 if many else 1_638_400)
+    steps = (48_000 if many else 38_400) if quick else 320_000  # the coarse stage of RUN gains nothing after half of it
     coarse = paper.resolutions[0]
     options: dict[str, Any] = {
         "preset": name,
@@ -262,11 +262,11 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
         "weight_average": 0.998,
         "eval_every": steps // (8 if quick else 40),
         "checkpoint_every": steps // (16 if quick else 80),
-        "log_every": 320 if quick else 4_800,
+        "log_every": 320 if quick else 1_600,
     } | SAC.get(task, {})
     if not quick:
         first = options["critics_first"][0] * (0.75 * (48_000 if many else 38_400))  # steps
-        options |= {"buffer_size": 100_000, "critics_first": (first / (0.5 * steps), 0.01)}
+        options |= {"buffer_size": 100_000, "critics_first": (first / (0.5 * steps), 0.05)}
     return replace(paper, **options)
 
 
