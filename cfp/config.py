@@ -506,7 +506,8 @@ class WindowConfig(RunConfig):
     reward_scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward per step after success, as if the episode went on for 1 / (1 - gamma) steps, at most 100; 0: none."""
+    """Reward of each step in which the task is solved, which the critic values; an episode that ends with success is
+    valued as if it went on so for 1 / (1 - gamma) steps, at most 100. 0: none."""
 
     def for_training(self: Config) -> Config:
         """These options, with the environment that is trained in."""

@@ -247,7 +247,7 @@ class WindowCollector(Resumable):
         self.env, self.observe = env, observe
         self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
         self.config = config
-        self.success_value = config.reward_scale * config.success_reward / discount_rate(config.gamma)
+        self.success_reward = config.reward_scale * config.success_reward
         self.dropped = 0  # in the windows whose scalars were read
         self._dropped_now = torch.zeros((), dtype=torch.int64, device=env.device)
         self._is_measured = env.device.type == "cpu"  # the memory that a step keeps for gradients
@@ -284,7 +284,8 @@ class WindowCollector(Resumable):
             reward = training_reward(self.config, env, centre, smooth_reward, info, neighbours).float()
             next_observation = self.observe()
             success = info.get("is_success", terminated.new_zeros(()))
-            final_value = torch.where(success, self.success_value, 0.0)
+            reward = reward + torch.where(success, self.success_reward, 0.0)
+            final_value = torch.where(success, self.success_reward / discount_rate(self.config.gamma), 0.0)
             next_value = torch.where(terminated, final_value, value(next_observation))
             true_rewards = info["true_reward"].detach()
             is_over = self.episodes.record(true_rewards, terminated)

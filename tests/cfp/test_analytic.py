@@ -206,19 +206,20 @@ def test_a_trained_policy_is_kept_until_the_critic_has_learned(tmp_path):
     assert not torch.equal(parameters(learner.actor), before)
 
 
-@pytest.mark.parametrize(("success", "expected"), [(True, 1.0), (False, 0.0)])
-def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, expected):
-    def ends_at_once(transition, spec):
-        over = torch.ones_like(transition.now.com[:, 0], dtype=torch.bool)
-        return Reward(terms={}, terminated=over, success=over & success)
+@pytest.mark.parametrize(("success", "ends", "paid", "value"), [(1, 1, 0.1, 1.0), (0, 1, 0.0, 0.0), (1, 0, 0.1, 7.0)])
+def test_steps_with_success_pay_the_option_and_an_end_with_success_has_its_value(success, ends, paid, value):
+    def solved(transition, spec):
+        always = torch.ones_like(transition.now.com[:, 0], dtype=torch.bool)
+        return Reward(terms={}, terminated=always & bool(ends), success=always & bool(success))
 
-    spec = replace(dittogym.make_spec("run"), reward_fn=ends_at_once, weights={"alive": 1.0})
+    spec = replace(dittogym.make_spec("run"), reward_fn=solved, weights={"alive": 0.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
     # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
     config = WindowConfig(task="run", algo="shac", success_reward=2.0, window=1, gamma=0.9, max_episode_steps=10)
     collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0, go_on)
-    assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]
+    assert window.rewards.tolist() == [[pytest.approx(paid, abs=1e-6)] * 2]
+    assert window.next_values.tolist() == [[pytest.approx(value)] * 2]
 
 
 def test_gradients_that_are_not_finite_are_left_out_with_a_warning():
