@@ -191,6 +191,8 @@ class RunConfig(EnvironmentConfig, TaskConfig):
             check_at_least(1, substeps=self.substeps)
         check_positive(dt=self.dt)
         check_training_seeds("num_envs", self.num_envs)
+        if self.resample and not isinstance(self, LearningConfig):
+            raise ConfigError(f"resample must be False for {self.algo}, whose resets have seeds of their own, got True")
         self.for_training()  # checks its options
 
 
@@ -329,6 +331,10 @@ class VariationConfig(StagedConfig):
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
         check_decay(vary_physics=self.vary_physics)
+        for option in dataclasses.fields(VariationConfig):
+            given = getattr(self, option.name)
+            if not self.vary and option.name.startswith("vary_") and given != option.default:
+                raise ConfigError(f"{option.name} requires vary, the probability with which it applies, got {given}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -517,8 +523,6 @@ class WindowConfig(RunConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        if self.resample:
-            raise ConfigError(f"resample must be False for {self.algo}, got True; num_layouts says how many are drawn")
         check_at_least(1, window=self.window, critic_updates=self.critic_updates)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)

@@ -124,6 +124,13 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
         """Check what the types do not express."""
         super().check()
         self.check_planner(self.planner_resolution)
+        if self.teacher != "mpc":
+            planner, grid = planner_preset(self.task)
+            for name, usual in {**vars(planner), "planner_grid": grid}.items():
+                if (given := getattr(self, name)) != usual:
+                    raise ConfigError(
+                        f"{name} requires teacher mpc, which alone plans, got {given} with {self.teacher}"
+                    )
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
