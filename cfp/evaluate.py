@@ -147,6 +147,8 @@ def run(command: Command) -> str:
     check_files(files, options)
     if command.record is not None and command.record.suffix != ".npz":
         raise ConfigError(f"record must end in .npz, got {command.record}")
+    if command.record is None and command.record_fields != Command.record_fields:
+        raise ConfigError(f"record_fields requires record, a file .npz, got {' '.join(command.record_fields)}")
     config, policies = command.open()
     for name, path in {**files, "record": command.record}.items():
         if path is not None:
