@@ -51,7 +51,8 @@ class EnvironmentConfig:
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
-    """Draw the particles anew at every reset; only with soft actor-critic."""
+    """Draw the particles anew at every reset; only with soft actor-critic, and not in GROW and OBSTACLE, whose starts
+    are alike."""
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: str | None = None
@@ -90,9 +91,9 @@ class RunConfig(EnvironmentConfig, TaskConfig):
     eval_every: int = 10_000
     """Environment steps between evaluations; 0: none."""
     eval_episodes: int = 5
-    """Episodes of an evaluation and of the final table."""
+    """Episodes of an evaluation and of the final table; a plan is evaluated in the one that it was made for."""
     eval_deterministic: bool = False
-    """Evaluate without action noise."""
+    """Evaluate without action noise, where the policy has some."""
     checkpoint_every: int = 1_000
     """Environment steps between checkpoints."""
     log_every: int = 500
@@ -203,7 +204,8 @@ Config = TypeVar("Config", bound=RunConfig)
 class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution.
 
-    Options with a value for each stage are listed coarsest first; the last value holds for all further stages.
+    Options with a value for each stage are listed coarsest first; the last value holds for all further stages, and
+    values beyond the last stage have no effect.
     """
 
     steps: int
@@ -217,7 +219,7 @@ class StagedConfig(RunConfig):
     interpolation: Interpolation = "half_pixel"
     """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
     split: bool = False
-    """Separate narrow encoders for observation and action."""
+    """Separate narrow encoders for observation and action, of the paper's networks; the small ones have one."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
@@ -498,13 +500,15 @@ class WindowConfig(RunConfig):
     max_episode_steps: int = 400
     """Control steps after which training episodes end, the first ones earlier; at most the task's horizon."""
     num_layouts: int = 16
-    """Particle layouts that training episodes start from in turn."""
+    """Particle layouts that training episodes start from in turn, under varied conditions as many as episodes; in
+    GROW and OBSTACLE all are the same."""
     reward: Literal["task", "speed"] = "task"
     """Training reward: task (its own, made smooth) or speed (60 per m/s to the right, less the cost of action)."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin."""
+    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin; no effect in
+    tasks without a limit, such as SHAPE MATCH."""
     split_margin: float = 0.85
-    """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
+    """Fraction of the limit beyond which the spread costs."""
     integrity_weight: float = 300.0
     """Weight of the cost of neighbouring particles that drift apart within a window."""
     piece_weight: float = 0.0

@@ -66,7 +66,7 @@ class Command:
     device: str = "auto"
     """cpu, cuda, or auto."""
     episodes: int = 5
-    """Episodes of each row."""
+    """Episodes of each row. In GROW and OBSTACLE, whose starts are alike, those without noise are all the same."""
     noise: Noise = "default"
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     json: bool = False

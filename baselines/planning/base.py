@@ -37,7 +37,7 @@ class PlannerConfig:
     positive."""
     split_weight: float = 1000.0
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
-    exceeds 0.8."""
+    exceeds 0.8; no effect in tasks without a limit, such as SHAPE MATCH."""
 
     def check_planner(self, resolution: int) -> None:
         """Check what the types do not express, for plans on an action grid of ``resolution`` rows and columns.
