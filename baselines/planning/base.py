@@ -58,8 +58,8 @@ class Planner(Resumable, ABC, Generic[Config]):
     """Plans the next actions of every simulation of an environment, each simulation by itself.
 
     Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
-    everything. The part of a plan that was not carried out is kept and extended by noise. Of all plans met in a search,
-    the one with the highest true return is carried out.
+    everything but the conditions that disturb actions. The part of a plan that was not carried out is kept and extended
+    by noise. Of all plans met in a search, the one with the highest true return is carried out.
 
     Args:
         env: The environment, after its reset. It is only read.
