@@ -219,7 +219,7 @@ class StagedConfig(RunConfig):
     interpolation: Interpolation = "half_pixel"
     """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
     split: bool = False
-    """Separate narrow encoders for observation and action, of the paper's networks; the small ones have one."""
+    """Separate narrow encoders for observation and action, in the paper's networks; small ones always have them."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
