@@ -97,7 +97,7 @@ def episodes(task: str, policy: Policy) -> tuple[list[float], list[bool]]:
     """Returns and successes of a policy under the protocol."""
     environment = vars(ENVIRONMENT) | {"action_layout": trained_layout(policy) or "image"}
     config: RunConfig = replace(configure({"task": task}), device="cpu", **environment)
-    if any(body.shape.draws for body in make_spec(task).bodies):
+    if not make_spec(task).starts_alike:
         played = play_episodes(config, policy, SEEDS, deterministic=True)
     else:
         played = ()

@@ -51,7 +51,8 @@ class EnvironmentConfig:
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
-    """Draw the particles anew at every reset; only with soft actor-critic."""
+    """Draw the particles anew at every reset; only with soft actor-critic, and not in GROW and OBSTACLE, whose starts
+    are alike."""
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: str | None = None
@@ -90,9 +91,9 @@ class RunConfig(EnvironmentConfig, TaskConfig):
     eval_every: int = 10_000
     """Environment steps between evaluations; 0: none."""
     eval_episodes: int = 5
-    """Episodes of an evaluation and of the final table."""
+    """Episodes of an evaluation and of the final table; a plan is evaluated in the one that it was made for."""
     eval_deterministic: bool = False
-    """Evaluate without action noise."""
+    """Evaluate without action noise, where the policy has some."""
     checkpoint_every: int = 1_000
     """Environment steps between checkpoints."""
     log_every: int = 500
@@ -191,6 +192,8 @@ class RunConfig(EnvironmentConfig, TaskConfig):
             check_at_least(1, substeps=self.substeps)
         check_positive(dt=self.dt)
         check_training_seeds("num_envs", self.num_envs)
+        if self.resample and not isinstance(self, LearningConfig):
+            raise ConfigError(f"resample must be False for {self.algo}, whose resets have seeds of their own, got True")
         self.for_training()  # checks its options
 
 
@@ -201,7 +204,8 @@ Config = TypeVar("Config", bound=RunConfig)
 class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution.
 
-    Options with a value for each stage are listed coarsest first; the last value holds for all further stages.
+    Options with a value for each stage are listed coarsest first; the last value holds for all further stages, and
+    values beyond the last stage have no effect.
     """
 
     steps: int
@@ -215,7 +219,7 @@ class StagedConfig(RunConfig):
     interpolation: Interpolation = "half_pixel"
     """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
     split: bool = False
-    """Separate narrow encoders for observation and action."""
+    """Separate narrow encoders for observation and action, in the paper's networks; small ones always have them."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
@@ -329,6 +333,10 @@ class VariationConfig(StagedConfig):
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
         check_decay(vary_physics=self.vary_physics)
+        for option in dataclasses.fields(VariationConfig):
+            given = getattr(self, option.name)
+            if not self.vary and option.name.startswith("vary_") and given != option.default:
+                raise ConfigError(f"{option.name} requires vary, the probability with which it applies, got {given}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -492,13 +500,15 @@ class WindowConfig(RunConfig):
     max_episode_steps: int = 400
     """Control steps after which training episodes end, the first ones earlier; at most the task's horizon."""
     num_layouts: int = 16
-    """Particle layouts that training episodes start from in turn."""
+    """Particle layouts that training episodes start from in turn, under varied conditions as many as episodes; in
+    GROW and OBSTACLE all are the same."""
     reward: Literal["task", "speed"] = "task"
     """Training reward: task (its own, made smooth) or speed (60 per m/s to the right, less the cost of action)."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin."""
+    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin; no effect in
+    tasks without a limit, such as SHAPE MATCH."""
     split_margin: float = 0.85
-    """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
+    """Fraction of the limit beyond which the spread costs."""
     integrity_weight: float = 300.0
     """Weight of the cost of neighbouring particles that drift apart within a window."""
     piece_weight: float = 0.0
@@ -517,8 +527,6 @@ class WindowConfig(RunConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        if self.resample:
-            raise ConfigError(f"resample must be False for {self.algo}, got True; num_layouts says how many are drawn")
         check_at_least(1, window=self.window, critic_updates=self.critic_updates)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)

@@ -66,7 +66,7 @@ class Command:
     device: str = "auto"
     """cpu, cuda, or auto."""
     episodes: int = 5
-    """Episodes of each row."""
+    """Episodes of each row. In GROW and OBSTACLE, whose starts are alike, those without noise are all the same."""
     noise: Noise = "default"
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     json: bool = False
@@ -147,6 +147,8 @@ def run(command: Command) -> str:
     check_files(files, options)
     if command.record is not None and command.record.suffix != ".npz":
         raise ConfigError(f"record must end in .npz, got {command.record}")
+    if command.record is None and command.record_fields != Command.record_fields:
+        raise ConfigError(f"record_fields requires record, a file .npz, got {' '.join(command.record_fields)}")
     config, policies = command.open()
     for name, path in {**files, "record": command.record}.items():
         if path is not None:

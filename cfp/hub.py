@@ -78,7 +78,7 @@ class Shareable:
         Args:
             repo: ``"OWNER/NAME"``; the repository is created if need be.
             results: Returns for the card, such as `cfp.Run.results`.
-            private: Create the repository as a private one.
+            private: Create the repository as a private one; one that exists stays as visible as it is.
 
         Returns:
             The address of this commit for `cfp.load`.

@@ -215,7 +215,10 @@ class UpdateLoop(BaseAlgorithm, Learner):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> UpdateLoop:
-        """Take at least ``total_timesteps`` environment steps, see stable-baselines3; rows are logged by update."""
+        """Take at least ``total_timesteps`` environment steps, see stable-baselines3; rows are logged by update.
+
+        Rates fall with the steps that the options give the stage, however many are taken here.
+        """
         resets = reset_num_timesteps or self._last_obs is None  # as `_setup_learn` does
         total, self._callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar

@@ -20,7 +20,7 @@ from cfp.evaluation.returns import Result, UntrainedPolicy, decision_grid, evalu
 from cfp.experiment.cli import read_command, run_command
 from cfp.files import check_output, write_text
 from cfp.hub import is_address
-from cfp.policy import Policy, policy_file
+from cfp.policy import Policy, check_trained_for, policy_file
 from cfp.tables import Table, columns, csv_text
 from dittogym import Conditions
 from dittogym.spec import DT, TaskSpec
@@ -173,8 +173,9 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     """All that a command evaluates for one policy, what is quick first."""
     file = policy_file(given)
     config, policies = open_policy(given, command.device, None)
-    config = replace(config, dt=DT, substeps=None, dtype="float32")
-    policy, spec = policies[file.stem], config.make_spec()
+    config, policy = replace(config, dt=DT, substeps=None, dtype="float32"), policies[file.stem]
+    check_trained_for("policies", policy.description, config.task, config.environment)  # of another control step
+    spec = config.make_spec()
     name = given if is_address(given) else file.resolve().parent.name if file.stem == "policy" else file.stem
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
     lite: tuple[str, Tier, int] = (UNDISTURBED, "lite", command.disturbed)

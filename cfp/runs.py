@@ -87,7 +87,7 @@ class Run:
 
         Args:
             repo: ``"OWNER/NAME"``.
-            private: Create the repository as a private one.
+            private: Create the repository as a private one; one that exists stays as visible as it is.
         """
         finished = (self.folder / "results.json").exists()
         return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)

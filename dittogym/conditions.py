@@ -44,7 +44,7 @@ class Conditions:
     """From which ranges each episode draws its conditions, uniformly; a single number is always taken.
 
     Entries of actions are those of the policy's own grid. A factor has no effect in a task whose bodies do not take the
-    constant. Rewards, ``info`` and pictures show what happens, not what the policy sees.
+    constant, or that has no gravity. Rewards, ``info`` and pictures show what happens, not what the policy sees.
 
     Raises:
         ValueError: A range is empty or out of bounds. The environment raises one where it has no room for a start, or

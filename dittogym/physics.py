@@ -49,8 +49,8 @@ def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor
 
     Args:
         given: Mapping from ``dittogym.physics.NAMES`` to numbers or arrays of shape () or (B,); for ``gravity`` (2,) or
-            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first; the values of particles whose body has a
-            material of its own (the soil of DIG), and the yield stress of objects, have no effect.
+            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first. Of particles whose body has a material of
+            its own (the soil of DIG) only the mass has an effect; the yield stress of objects has none.
         particles: Number N of particles.
         like: (B,), gives dtype and device.
 

@@ -174,6 +174,11 @@ class TaskSpec:
         return (self.robot, *self.objects)
 
     @property
+    def starts_alike(self) -> bool:
+        """Whether particles start in the same places whatever the seed, as in GROW and OBSTACLE."""
+        return not any(body.shape.draws for body in self.bodies)
+
+    @property
     def observed_boxes(self) -> tuple[Box, ...]:
         """What the robot sees of obstacles and goal."""
         boxes = tuple(box for obstacle in self.obstacles for box in obstacle.observed_boxes)

@@ -59,7 +59,8 @@ class TorchEnv:
         backend: Of the solver, see :class:`torchmpm.Solver`.
         action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
             ``"grid"``: (x, y), as in the reference implementation. ``None`` stands for ``"image"``.
-        resample: Draw new particles at every reset, not only at a seeded one.
+        resample: Draw new particles at every reset, not only at a seeded one; no effect where
+            ``TaskSpec.starts_alike``.
         deterministic: Refuse what does not repeat bit by bit: CUDA.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
         conditions: From which ranges each episode draws its start, the constants of its matter and its disturbances;

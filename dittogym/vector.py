@@ -68,7 +68,8 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
         render_size: Pixels per side of pictures.
-        max_episode_steps: Horizon instead of the task's; -1: unlimited.
+        max_episode_steps: Horizon instead of the task's; -1: unlimited. That of the id, which Gymnasium passes where
+            none is given, stands for the task's with its options.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
     Raises:

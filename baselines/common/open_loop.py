@@ -114,7 +114,10 @@ class OpenLoopLearner(Learner):
         *,
         reset_num_timesteps: bool = True,
     ) -> None:
-        """Take at least ``total_timesteps`` more environment steps, with the callbacks of stable-baselines3."""
+        """Take at least ``total_timesteps`` more environment steps, with the callbacks of stable-baselines3.
+
+        ``log_interval`` and ``reset_num_timesteps`` have no effect: callbacks write the rows, and steps are counted on.
+        """
         callback.init_callback(cast(BaseAlgorithm, self))
         callback.on_training_start(locals(), globals())
         end = self.num_timesteps + total_timesteps

@@ -59,7 +59,7 @@ class Command:
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
     SHAPE MATCH and with it in all other tasks."""
     workers: int = 1
-    """Runs at a time, each in a process of its own."""
+    """Runs at a time, each in a process of its own; on a cluster Ray decides."""
     cpus_per_run: int | None = None
     """Cores of a run; if not given, an equal share of this machine's for each worker, or 1 on a cluster."""
     gpus_per_run: float = 0.0
@@ -86,6 +86,10 @@ class Command:
         for name, value in (("gpus_per_run", self.gpus_per_run), ("address", self.address)):
             if value and self.executor == "local":
                 raise ConfigError(f"{name} requires --executor ray, got {value}")
+        if self.workers > 1 and self.executor == "ray":
+            raise ConfigError(
+                f"workers requires --executor local (Ray starts what its cluster can), got {self.workers}"
+            )
         if self.only is not None and self.report_only:
             raise ConfigError(f"only cannot be combined with --report-only, got {self.only}")
 

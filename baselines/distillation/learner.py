@@ -72,7 +72,8 @@ METRICS: dict[str, str] = {
 class DistillConfig(GradientPlannerConfig, StagedConfig):
     """A distillation; num_envs robots move side by side. Stages are listed coarsest first.
 
-    The environment options say where the student is evaluated; train_particles, where it is taught.
+    The environment options say where the student is evaluated; train_particles, where it is taught. The options of
+    planning, from horizon to clip, and planner_grid are those of the teacher mpc, and refused with others.
     """
 
     algo: str = "distill"
@@ -101,7 +102,7 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     max_episode_steps: int = 400
     """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
     num_layouts: int = 64
-    """Particle layouts that training episodes start from in turn."""
+    """Particle layouts that training episodes start from in turn; in GROW and OBSTACLE all are the same."""
     planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
 
@@ -124,6 +125,13 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
         """Check what the types do not express."""
         super().check()
         self.check_planner(self.planner_resolution)
+        if self.teacher != "mpc":
+            planner, grid = planner_preset(self.task)
+            for name, usual in {**vars(planner), "planner_grid": grid}.items():
+                if (given := getattr(self, name)) != usual:
+                    raise ConfigError(
+                        f"{name} requires teacher mpc, which alone plans, got {given} with {self.teacher}"
+                    )
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
@@ -498,7 +506,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
         if config.teacher in ("mpc", *TRAINED) or "layout" not in read_policy(teacher_path(folder))[1]:
             return []
-        if not any(body.shape.draws for body in config.make_spec().bodies):
+        if config.make_spec().starts_alike:
             return []
         return [
             f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "

@@ -37,7 +37,7 @@ class PlannerConfig:
     positive."""
     split_weight: float = 1000.0
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
-    exceeds 0.8."""
+    exceeds 0.8; no effect in tasks without a limit, such as SHAPE MATCH."""
 
     def check_planner(self, resolution: int) -> None:
         """Check what the types do not express, for plans on an action grid of ``resolution`` rows and columns.
@@ -58,8 +58,8 @@ class Planner(Resumable, ABC, Generic[Config]):
     """Plans the next actions of every simulation of an environment, each simulation by itself.
 
     Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
-    everything. The part of a plan that was not carried out is kept and extended by noise. Of all plans met in a search,
-    the one with the highest true return is carried out.
+    everything but the conditions that disturb actions. The part of a plan that was not carried out is kept and extended
+    by noise. Of all plans met in a search, the one with the highest true return is carried out.
 
     Args:
         env: The environment, after its reset. It is only read.

@@ -60,7 +60,7 @@ class ActorSpec:
         resolutions: Action grid R of each stage, coarsest first; a single entry describes a plain (stage 1) actor.
         gate_bias: Bias added to the gate logit, one for each residual stage (``len(resolutions) - 1`` values).
         split: Separate narrow encoders for observation and action, for tasks in which the two images show different
-            places.
+            places; the small networks always have them.
         gate_scale: Largest gate value; the reference implementation uses 0.25 with split encoders and 1 otherwise.
         interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` as the environment upsamples actions,
             ``"aligned"`` (aligned corners) as the reference implementation does here.

@@ -174,7 +174,8 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     Args:
         policy: ``"NetworksPolicy"``.
-        env: A `cfp.TorchVecEnv`, in which it is trained; num_envs, particles and substeps are the environment's.
+        env: A `cfp.TorchVecEnv`, in which it is trained; num_envs, particles and substeps are the environment's, starts
+            and lengths of episodes those of ``config``.
         config: Options, see `cfp.preset`.
         stage: Which stage it learns, 1 is the coarsest.
         device: Of networks and simulation.

@@ -418,9 +418,10 @@ def explain(config: RunConfig, results: Sequence[Result], chosen: bool) -> str:
     if chosen and config.eval_every:
         varied = any(config.conditions(stage) for stage in range(1, len(config.ends()) + 1))
         conditions = " Conditions varied in the episodes of training, and do not vary in these." if varied else ""
+        starts = "" if config.make_spec().starts_alike else ", from starts that neither trained nor chose the policy"
         sentences.append(
             "Evaluations during training give other numbers: they chose the policy, so the best of them is partly "
-            f"luck. This table is of other episodes, from starts that neither trained nor chose the policy.{conditions}"
+            f"luck. This table is of other episodes{starts}.{conditions}"
         )
     if any(result.name == PLAN for result in results):
         sentences.append(

@@ -242,6 +242,8 @@ class CFP(SAC):
         **sac_options: Any,
     ) -> None:
         hyperparameters.check()
+        if "n_steps" in sac_options:  # which stable-baselines3 leaves to a replay memory of its own
+            raise TypeError(f"n_steps must be one of the hyperparameters, got {sac_options['n_steps']} beside them")
         self.hyperparameters = own = hyperparameters
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
         composition = Composition.of(spec) if spec else None

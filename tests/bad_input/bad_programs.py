@@ -7,6 +7,8 @@ from bad_cases import TINY, Case, Refused, command, prepared
 
 NEW = " --out {folder}/new "
 SMALL = "--particles 100 --substeps 1 --eval-episodes 1 --no-video --device cpu"
+#: Algorithms whose resets are all seeded.
+SEEDED = ("cfp-analytic", "shac", "gradient", "mpc", "cem", "distill")
 PROGRAMS = {
     "train": ("cfp.train", TINY + NEW),
     "learn": ("baselines.train", SMALL + NEW),
@@ -118,7 +120,10 @@ OTHERS = (
         ("--algo shac --split-margin -0.5", "split_margin must be at least 0, got -0.5"),
         ("--algo shac --start-from run", "start_from"),
         ("--algo shac --num-layouts 50000", "num_layouts must be at most"),
-        ("--algo cfp-analytic --resample", "resample must be False"),
+        *((f"--algo {algo} --resample", "resample must be False") for algo in SEEDED),
+        ("--algo cfp-analytic --vary-latency 3", "vary_latency requires vary"),
+        ("--algo distill --teacher run --task run --learning-rate 0.01", "learning_rate requires teacher mpc"),
+        ("--algo distill --planner-grid 4", "planner_grid requires teacher mpc"),
     )
     + rows(
         "distill",

@@ -328,6 +328,7 @@ def test_options_become_words():
         ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
         ("--only 0 --report-only", "only cannot be combined with --report-only"),
         ("--address head:6379", "address requires --executor ray, got head:6379"),
+        ("--executor ray --workers 2", "workers requires --executor local"),
         ("--algos mpc other", "plan: algos.other must not hold target"),
     ],
 )

@@ -148,6 +148,8 @@ def test_json_values_take_the_types_of_their_fields():
         ({"algo": "cfp-analytic", "weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
         ({"algo": "cfp-analytic", "num_layouts": 9_999}, "num_layouts must be at most 9992"),
         ({"algo": "cfp-analytic", "resample": True}, "resample must be False for cfp-analytic"),
+        ({"vary_noise": 0.5}, "vary_noise requires vary"),
+        ({"algo": "cfp-analytic", "vary_start": 0.0}, "vary_start requires vary"),
         ({"algo": "cfp-analytic", "train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
     ],
 )

@@ -12,7 +12,7 @@ from fakes import FakeEnv
 from cfp import messages
 from cfp.errors import ConfigError
 from cfp.evaluate import Command
-from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, make_trial
+from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, explain, make_trial
 from cfp.presets import preset
 from dittogym import Conditions
 
@@ -160,3 +160,8 @@ def test_a_policy_can_be_evaluated_with_other_substeps():
 
 def test_the_seed_chooses_the_episodes():
     assert [Command(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]
+
+
+def test_the_table_claims_other_starts_only_where_starts_differ():
+    claims = {task: "from starts" in explain(preset(task), [], True) for task in ("run", "grow", "obstacle")}
+    assert claims == {"run": True, "grow": False, "obstacle": False}

@@ -137,6 +137,7 @@ def test_video_and_replay_or_how_to_install(finished, tmp_path, monkeypatch, cap
         ("--video film.avi", "video must end in .mp4 or .gif or .webp or .png, got film.avi"),
         ("--replay film.mp4", "replay must end in .html, got film.mp4"),
         ("--video film.mp4 --size 3", "size must be at least 16, got 3"),
+        ("--record-fields x", "record_fields requires record"),
     ],
 )
 def test_files_of_films_are_checked_first(options, message, capsys):

@@ -154,6 +154,13 @@ def test_action_noise_of_the_policy_is_an_option_and_has_rows_of_its_own(folder,
     assert own == [(case, noise) for noise in ("with", "without") for case in ("undisturbed", "latency")]
 
 
+def test_policy_for_another_control_step_is_refused(folder, tmp_path, capsys):
+    config = replace(sac_preset("shapematch"), substeps=50)
+    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    assert command(folder, tmp_path / "rows.csv") == 2
+    assert "policies must be a policy for environment steps of 0.01 s, got 0.005" in capsys.readouterr().err
+
+
 def test_table_must_be_one_of_evaluations(folder, tmp_path, capsys):
     (tmp_path / "other.csv").write_text("step,mean\n1,2\n")
     assert command(folder, tmp_path / "other.csv") == 2

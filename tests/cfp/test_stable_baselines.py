@@ -116,6 +116,11 @@ def test_saved_model_acts_the_same_and_learns_on(algorithm, with_env, tmp_path):
     assert again.num_timesteps == 32
 
 
+def test_steps_of_a_return_are_a_hyperparameter():
+    with pytest.raises(TypeError, match=r"n_steps must be one of the hyperparameters, got 3"):
+        CFP("CFPPolicy", make_env(), n_steps=3, device="cpu")
+
+
 def test_features_are_those_of_the_encoder():
     box = spaces.Box(0, 255, (3, 64, 64), np.uint8)
     extractor = ImageFeatures(box, 32)

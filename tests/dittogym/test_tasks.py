@@ -159,3 +159,11 @@ def published_pixels(task: str, origin_x: float) -> torch.Tensor:
 def test_the_robot_sees_the_published_pixels(task: str, com: float) -> None:
     origin = float(dittogym.make_spec(task).window.origin(torch.tensor([[com, 0.2]], dtype=torch.float64))[0, 0])
     assert torch.equal(drawn_pixels(task, origin), published_pixels(task, origin))
+
+
+@pytest.mark.parametrize("task", dittogym.TASKS)
+def test_starts_are_alike_where_the_task_says_so(task):
+    env = dittogym.TorchEnv(task, 2, particles=100, substeps=1)
+    env.reset(seed=[0, 1])
+    alike = torch.equal(*env.state.x)
+    assert env.spec.starts_alike == alike == (task in ("grow", "obstacle"))
