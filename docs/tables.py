@@ -11,6 +11,7 @@ import json
 import math
 import pkgutil
 import re
+import statistics
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -268,27 +269,67 @@ def leaderboard() -> str:
 def pivot(
     rows: Iterable[Row], index: Sequence[str], columns: Sequence[str], value: str
 ) -> tuple[list[tuple[str, ...]], list[list[str]]]:
-    """Heads and lines of a table that has a line for each value of some columns and a cell for each of others."""
-    lines: dict[tuple[str, ...], dict[tuple[str, ...], str]] = {}
+    """Heads and lines of a table: a line for each value of some columns, a cell, maybe a list, for each of others."""
+    lines: dict[tuple[str, ...], dict[tuple[str, ...], list[str]]] = {}
     for row in rows:
-        lines.setdefault(tuple(row[key] for key in index), {})[tuple(row[key] for key in columns)] = row[value]
+        line = lines.setdefault(tuple(row[key] for key in index), {})
+        line.setdefault(tuple(row[key] for key in columns), []).append(row[value])
     heads = sorted({head for line in lines.values() for head in line})
-    return heads, [[*key, *(line.get(head, "") for head in heads)] for key, line in lines.items()]
+    return heads, [[*key, *(", ".join(line.get(head, [])) for head in heads)] for key, line in lines.items()]
 
 
 def ablation_gradients() -> str:
     """Final returns of the learner from gradients while one option is changed at a time, on SHAPE MATCH."""
-    rows = [row for row in read("analytic-shapematch.csv") if row["final"]]
-    rows.sort(key=lambda row: -int(row["final"]))
-    _, lines = pivot(rows, ("part", "value"), ("seed",), "final")
-    return markdown(("Changed", "To", "Return, seed 0", "Return, seed 1"), lines)
+    _, lines = pivot((row for row in read("analytic-shapematch.csv") if row["final"]), ("part", "value"), (), "final")
+    options: dict[str, list[str]] = {}
+    for part, value, finals in lines:
+        options.setdefault(part, []).append(f"{value}: {finals}")
+    return markdown(("Option", "Value: returns"), ([part, "; ".join(values)] for part, values in options.items()))
 
 
 def ablation_rewards() -> str:
     """Returns of the learner from rewards with each option left out, over ten episodes."""
     rows = [row | {"mean": number(row["mean"])} for row in read("rewards-ablation.csv") if row["episodes"]]
-    heads, lines = pivot(rows, ("change",), ("task", "seed"), "mean")
-    return markdown(("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in heads)), lines)
+    heads, lines = pivot(rows, ("change",), ("task",), "mean")
+    return markdown(("Left out or changed", *(name_of(task) for (task,) in heads)), lines)
+
+
+def trainings(rows: Iterable[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+    """Evaluations of each training, by the columns that tell trainings apart."""
+    found: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in names), []).append(row)
+    return found
+
+
+def highest(evaluations: Iterable[Row]) -> Row:
+    """The evaluation with the highest return."""
+    return max(evaluations, key=lambda row: float(row["mean"]))
+
+
+def refined_run() -> str:
+    """Returns of policies of RUN before a refinement on whole episodes and at its highest evaluation, by seed."""
+    refined = [row for row in read("run-seeds.csv") if " on whole episodes" in row["changed"]]
+    cells = []
+    for (changed, seed), (before, *later) in trainings(refined, "changed", "seed").items():
+        ends = (f"{number(row['mean'])} ({share(row['success'])})" for row in (before, highest(later)))
+        cells.append({"changed": changed.replace(" on whole episodes", ""), "seed": seed, "cell": " → ".join(ends)})
+    heads, lines = pivot(cells, ("changed",), ("seed",), "cell")
+    return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), lines)
+
+
+def rewards_long() -> str:
+    """Highest evaluation of trainings from rewards over at least 60,000 steps, and the mean of their last three."""
+    cells = []
+    for (task, n, change, seed), rows in trainings(read("rewards-long.csv"), "task", "cells", "change", "seed").items():
+        if int(rows[-1]["step"]) >= 60000:
+            best, last = highest(rows), statistics.fmean(float(row["mean"]) for row in rows[-3:])
+            change = re.sub(r"\d{4,}", lambda digits: number(digits[0]), change)
+            what = ", ".join(filter(None, (name_of(task), f"{n} × {n}", change)))
+            cell = f"{number(best['mean'])} at {number(best['step'])}; {last:,.0f}"
+            cells.append({"what": what, "seed": seed, "cell": cell})
+    heads, lines = pivot(cells, ("what",), ("seed",), "cell")
+    return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), sorted(lines))
 
 
 def best_rewards() -> str:
@@ -495,8 +536,10 @@ TABLES: dict[str, Callable[..., str]] = {
     "metrics": metrics,
     "planning": planning,
     "published": published,
+    "refined-run": refined_run,
     "results": results,
     "returns": returns,
+    "rewards-long": rewards_long,
     "tasks": tasks,
     "verification": verification,
 }
