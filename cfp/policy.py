@@ -175,7 +175,8 @@ class ActorPolicy(nn.Module, Shareable):
             Actions (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage (B, 2, R, R), 0
             where the coarser action is kept; ``None`` for a policy of one stage.
         """
-        batch = torch.as_tensor(observation, device=next(self.parameters()).device)
+        # A copy: torch takes no negative strides, as of a mirrored image, and warns of arrays that are read-only.
+        batch = torch.as_tensor(np.array(observation, order="C"), device=next(self.parameters()).device)
         sample = self.actor.sample(self.spec.filled(batch), deterministic)
         # This rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space.
         action: np.ndarray = (sample.action.cpu().numpy() + 1) - 1

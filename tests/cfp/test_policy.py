@@ -99,6 +99,14 @@ def test_what_is_no_image_is_refused(image, given):
             each.predict(image)
 
 
+def test_images_that_are_views_of_others() -> None:
+    """Mirrored ones, and read-only ones without a warning."""
+    policy, image = cfp.load("run"), np.random.default_rng(0).integers(0, 256, (3, 64, 64), np.uint8)
+    for view in (image[..., ::-1], np.broadcast_to(image, (2, 3, 64, 64))):
+        actions = [policy.predict(each, deterministic=True)[0] for each in (view, view.copy())]
+        assert np.array_equal(*actions)
+
+
 def test_description_stands_beside_and_inside_the_weights(saved):
     folder, _ = saved
     beside = json.loads((folder / "policy.json").read_text())
