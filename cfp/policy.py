@@ -131,7 +131,16 @@ class ActorPolicy(nn.Module, Shareable):
         return self.spec.action_size
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``."""
+        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``.
+
+        For gradients with respect to an image call ``actor``, which takes floating-point ones in [-1, 1].
+
+        Raises:
+            ValueError: The observation is not uint8.
+        """
+        if observation.dtype != torch.uint8:
+            kind = str(observation.dtype).removeprefix("torch.")
+            raise ValueError(f"observation must be uint8, got {kind}; policy.actor takes images in [-1, 1]")
         action: Tensor = self.actor(self.spec.filled(observation), deterministic)
         return action
 
