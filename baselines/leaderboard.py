@@ -200,6 +200,10 @@ def run(command: Command) -> None:
     results = [read_results(Path(name)) for name in command.policies if name.endswith(".json")]
     names = [name for name in command.policies if not name.endswith(".json")]
     found = [candidate for name in names for candidate in candidates(name, command.tasks)]
+    hashes: dict[tuple[str, str], str | None] = {}
+    for row, _ in found:  # one file of results would replace the other
+        if hashes.setdefault((row["task"], row["policy"]), row["sha256"]) != row["sha256"]:
+            raise ConfigError(f"policies must have names of their own, got two called {row['policy']!r}")
     for row, policy in found:
         command.out.mkdir(parents=True, exist_ok=True)
         returns, successes = episodes(row["task"], policy)

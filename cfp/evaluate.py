@@ -85,7 +85,7 @@ class Command:
     def open(self) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
         if self.folder is not None and self.policy is None:
-            if not self.folder.exists() and str(self.folder) in shipped():
+            if self.folder.is_file() or (not self.folder.exists() and str(self.folder) in shipped()):
                 raise ConfigError(f"{self.folder}: there is no such folder; --policy {self.folder} names the policy")
             config, policies = open_run(self.folder, self.device, self.seed)
         elif self.policy is not None and self.folder is None:

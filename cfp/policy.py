@@ -131,7 +131,16 @@ class ActorPolicy(nn.Module, Shareable):
         return self.spec.action_size
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``."""
+        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``.
+
+        For gradients with respect to an image call ``actor``, which takes floating-point ones in [-1, 1].
+
+        Raises:
+            ValueError: The observation is not uint8.
+        """
+        if observation.dtype != torch.uint8:
+            kind = str(observation.dtype).removeprefix("torch.")
+            raise ValueError(f"observation must be uint8, got {kind}; policy.actor takes images in [-1, 1]")
         action: Tensor = self.actor(self.spec.filled(observation), deterministic)
         return action
 
@@ -175,7 +184,8 @@ class ActorPolicy(nn.Module, Shareable):
             Actions (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage (B, 2, R, R), 0
             where the coarser action is kept; ``None`` for a policy of one stage.
         """
-        batch = torch.as_tensor(observation, device=next(self.parameters()).device)
+        # A copy: torch takes no negative strides, as of a mirrored image, and warns of arrays that are read-only.
+        batch = torch.as_tensor(np.array(observation, order="C"), device=next(self.parameters()).device)
         sample = self.actor.sample(self.spec.filled(batch), deterministic)
         # This rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space.
         action: np.ndarray = (sample.action.cpu().numpy() + 1) - 1

@@ -74,7 +74,8 @@ class Command:
     """
 
     policies: tyro.conf.Positional[tuple[str, ...]]
-    """Run folders, policy files, names of policies that come with the package, or hf://OWNER/NAME."""
+    """Run folders, policy files, names of policies that come with the package, or hf://OWNER/NAME. Rows have the name
+    of the folder or of the file."""
     rows: Path | None = None
     """A table of evaluations (.csv) to put the results into. Rows that it has, of the same policy file and as many
     episodes, are kept, so that an evaluation that was stopped goes on; those of another file of that name are not."""
@@ -193,6 +194,15 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     return sorted((each for each in found if each.episodes), key=lambda each: each.particles == "full")
 
 
+def check_names(evaluations: Sequence[Evaluation]) -> None:
+    """Refuse different policies of one name, whose rows would replace each other."""
+    files: dict[tuple[str, str], str] = {}
+    for each in evaluations:
+        name = each.head["task"], each.name
+        if files.setdefault(name, each.sha256) != each.sha256:
+            raise ConfigError(f"policies must have names of their own, got two called {each.name!r} on {name[0]}")
+
+
 # Rows.
 
 
@@ -246,6 +256,7 @@ def run(command: Command) -> None:
     """Evaluate, put the rows into their table, and print what they say of each policy."""
     command.check()
     plans = [plan(command, given) for given in command.policies]
+    check_names([each for evaluations in plans for each in evaluations])
     rows = read_rows(command.rows)
     for evaluations in plans:
         heads = [each.head for each in evaluations]

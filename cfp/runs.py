@@ -154,7 +154,7 @@ def fit(
         video: Whether to record a video at the end.
         device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
         out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
-        resume: Continue the run in the folder.
+        resume: Continue the run in the folder, or start one if it holds none.
         quiet: Print nothing, and show no progress bar.
         on_evaluation: Called with each new row of ``evaluations.csv``, see `Run.evaluations`. An exception that it
             raises ends the training and comes out here; the run can be resumed from its last checkpoint.

@@ -113,7 +113,8 @@ class Shell:
 class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
 
-    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates itself.
+    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper, so an id of your own needs
+    ``max_episode_steps`` in :func:`gymnasium.register`; made directly it truncates itself.
 
     Args:
         task: Task name or specification.

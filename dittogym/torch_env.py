@@ -233,7 +233,9 @@ class TorchEnv:
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Restore a snapshot; the simulation continues bit for bit as it did before.
 
-        Positions and physics of the next reset, a ``TimeLimit``'s count, and learned materials are not part of it.
+        Positions and physics of the next reset, a ``TimeLimit``'s count, and learned materials are not part of it. What
+        the next episodes draw as conditions is: elements that were loaded with the same one draw alike until a seeded
+        reset.
 
         Args:
             snapshot: Of this environment or one like it; one of a single simulation goes into every element.

@@ -210,14 +210,19 @@ def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) ->
     """Info of a step in which some elements (B,) were reset: theirs is that of the reset, without a step's entries."""
     result = _with_masks(info, ~mask)
     for name, value in start.items():
-        result[name] = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, info[name])
+        result[name] = _where(mask, value, info[name])
         result["_" + name] = np.ones_like(mask)
     return result
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Info in Gymnasium's form: for each entry, ``_name`` says for which elements it holds."""
+    """Info in Gymnasium's form: for each entry, ``_name`` says for which elements it holds; those of others are 0."""
     result: dict[str, Any] = {}
     for name, value in info.items():
-        result[name], result["_" + name] = value, mask.copy()
+        result[name], result["_" + name] = _where(mask, value, np.zeros((), value.dtype)), mask.copy()
     return result
+
+
+def _where(mask: np.ndarray, value: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """``value`` of the elements in ``mask`` (B,), ``other`` of those outside."""
+    return np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, other)

@@ -24,9 +24,8 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     """
     box = _box(env, "action_space")
     size = checks.whole("size", size, 1, box.shape[-1])
-
-    enlarge = functools.partial(_enlarged, size=size, largest=box.shape[-1])
-    small = gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
+    small = _resized_space(box, size)
+    enlarge = functools.partial(_enlarged, small=small, largest=box.shape[-1])
     if isinstance(env, VectorEnv):
         batch = batch_space(small, env.num_envs)
         return gymnasium.wrappers.vector.TransformAction(env, enlarge, batch, small)
@@ -34,10 +33,11 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
 
 
 def observation_resolution(env: AnyEnv, size: int) -> Any:
-    """Observations of (3, size, size), reduced by averaging over areas."""
-    size = checks.whole("size", size, 1, _box(env, "observation_space").shape[-1])
+    """Observations of (..., 3, size, size), reduced by averaging over areas."""
+    box = _box(env, "observation_space")
+    size = checks.whole("size", size, 1, box.shape[-1])
+    small = _resized_space(box, size)
     reduce = functools.partial(_resized, size=size, interpolation=cv2.INTER_AREA)
-    small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
     if isinstance(env, VectorEnv):
         return _VectorObservation(env, reduce, small)
     return gymnasium.wrappers.TransformObservation(env, reduce, small)
@@ -75,11 +75,17 @@ def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
     return space
 
 
-def _enlarged(action: np.ndarray, size: int, largest: int) -> np.ndarray:
-    """Actions (..., size, size) at the resolution of the environment."""
-    if np.shape(action)[-2:] != (size, size):
-        raise ValueError(f"action must end in the shape {(size, size)}, got {np.shape(action)}")
-    return _resized(np.asarray(action, np.float32), largest, cv2.INTER_CUBIC).clip(-1.0, 1.0)
+def _resized_space(box: gymnasium.spaces.Box, size: int) -> gymnasium.spaces.Box:
+    """The space of resized images, with the range of ``box``, which another wrapper may have changed."""
+    low, high = box.low.min().item(), box.high.max().item()
+    return gymnasium.spaces.Box(low, high, (*box.shape[:-2], size, size), box.dtype.type)
+
+
+def _enlarged(action: np.ndarray, small: gymnasium.spaces.Box, largest: int) -> np.ndarray:
+    """Actions of ``small``, or a batch of them, at the resolution of the environment."""
+    if np.shape(action)[-2:] != small.shape[-2:]:
+        raise ValueError(f"action must end in the shape {small.shape[-2:]}, got {np.shape(action)}")
+    return _resized(np.asarray(action, np.float32), largest, cv2.INTER_CUBIC).clip(small.low.min(), small.high.max())
 
 
 def _resized(images: np.ndarray, size: int, interpolation: int) -> np.ndarray:

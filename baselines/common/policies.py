@@ -15,6 +15,7 @@ from cfp.hub import Shareable
 from cfp.policy import Memory, Observation, Start
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
+from torchmpm import checks
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -46,8 +47,10 @@ class StateBasedPolicy(Shareable, ABC):
         """Return the same policy, acting on the state of the environment ``env``.
 
         Raises:
+            TypeError: It is no `dittogym.TorchEnv`; a Gymnasium environment has one, ``env.unwrapped.torch_env``.
             ValueError: The environment is of a task with another number of features.
         """
+        checks.instance("env", env, TorchEnv)
         found = self.num_features(env.spec)
         if found != self.num_inputs:
             raise ValueError(

@@ -17,7 +17,7 @@ from cfp.errors import NonFiniteError
 from dittogym import env as dittogym_env
 from dittogym.copies import to_device
 from dittogym.vector import autoreset_step
-from torchmpm import tree
+from torchmpm import checks, tree
 
 #: What is wrong with actions that are not finite.
 DIVERGED = "an action is not finite: the policy has diverged"
@@ -38,6 +38,9 @@ class TorchVecEnv(VecEnv):
             ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
         tensors: Observations are tensors on the device, and so may actions be: of a GPU only numbers, and the last
             images of episodes, are copied to the host.
+
+    Raises:
+        ValueError: ``max_episode_steps`` is no whole number from 1.
     """
 
     def __init__(
@@ -48,7 +51,9 @@ class TorchVecEnv(VecEnv):
         tensors: bool = False,
     ) -> None:
         self.torch_env, self.tensors = env, tensors
-        self.max_episode_steps = None if max_episode_steps is None else min(max_episode_steps, env.spec.horizon)
+        if max_episode_steps is not None:  # -1 would end every episode in its first step
+            max_episode_steps = min(checks.whole("max_episode_steps", max_episode_steps, 1), env.spec.horizon)
+        self.max_episode_steps = max_episode_steps
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None

@@ -1,10 +1,11 @@
-"""Bodies, obstacles and conditions as values that JSON can hold, for Gymnasium's ``EnvSpec.to_json``."""
+"""Options, such as bodies and conditions, as values that JSON can hold, for Gymnasium's ``EnvSpec.to_json``."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from dataclasses import fields
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ def to_values(value: Any) -> Any:
         return str(value)
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, Enum):  # such as a mode of autoreset
+        return value.value
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.kind == "u" and value.shape[1:] != (2,):  # a picture; lists of whole numbers are outlines

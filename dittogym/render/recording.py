@@ -273,7 +273,7 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
         try:
             action = torch.as_tensor(chosen, device=env.device)
         except (RuntimeError, TypeError, ValueError) as error:
-            raise ValueError(f"policy must return actions, got {type(chosen).__name__}") from error
+            raise ValueError(f"policy must return actions, got {type(chosen).__name__}: {error}") from error
         observation, *end = env.step(action)
         images, ended = observation.cpu().numpy(), bool(end[1][index] | end[2][index])
         yield images, action.cpu().numpy(), end

@@ -5,6 +5,8 @@ from importlib import import_module
 
 from bad_cases import TINY, Case, Refused, command, prepared
 
+from cfp.policy import SHIPPED
+
 NEW = " --out {folder}/new "
 SMALL = "--particles 100 --substeps 1 --eval-episodes 1 --no-video --device cpu"
 #: Algorithms whose resets are all seeded.
@@ -135,6 +137,7 @@ OTHERS = (
         ("", "either policy or a folder must be given, got neither"),
         ("{folder} --policy run", "either policy or a folder must be given"),
         ("run", "there is no such folder; --policy run names the policy"),
+        (f"{SHIPPED}/run.safetensors", "run.safetensors names the policy"),
         ("{folder}/none", "none: there is no run (no config.json)"),
         ("{folder}", "there is no run"),
         ("--policy alchemy", "no shipped one has that name"),

@@ -98,6 +98,17 @@ def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     ]
 
 
+def test_different_policies_of_one_name_are_refused(tmp_path, capsys):
+    """Their files of results would have the same name."""
+    config = replace(preset("shapematch", "quick"), **vars(ENVIRONMENT))
+    files = [tmp_path / name / "mine" / "policy.safetensors" for name in ("first", "second")]
+    for file in files:
+        file.parent.mkdir(parents=True)
+        save_actor(file, build_actor(config.actor_spec(1)), config, 1, 0)
+    assert main([*map(str, files), "--out", str(tmp_path / "out")]) == 2
+    assert "policies must have names of their own, got two called 'mine'" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path):
     assert main(["zero", "--tasks", "obstacle", "--out", str(tmp_path)]) == 0

@@ -17,7 +17,7 @@ from cfp.envs.make import make_env, make_torch_env
 from cfp.errors import CheckpointError, NonFiniteError
 from cfp.evaluation.returns import evaluate, make_trial
 from cfp.policy import attached, describe_run
-from dittogym import TorchEnv
+from dittogym import Env, TorchEnv
 
 
 def options(task="run", **changes):
@@ -176,6 +176,8 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     learner, path = make(), tmp_path / "policy.safetensors"
     with pytest.raises(ValueError, match="got 'kick'"):
         learner.trained_policy.attached(TorchEnv("kick", 1, particles=100))
+    with pytest.raises(TypeError, match="env must be a TorchEnv, got"):
+        learner.trained_policy.attached(Env("run", particles=100))
     learner.save_policy(path, describe_run(learner.config, "shac", 1, 0))
     path.write_bytes(path.read_bytes().replace(b"inputs", b"output"))
     with pytest.raises(CheckpointError):

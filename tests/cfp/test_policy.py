@@ -99,6 +99,25 @@ def test_what_is_no_image_is_refused(image, given):
             each.predict(image)
 
 
+def test_gradients_with_respect_to_an_image_are_those_of_the_actor() -> None:
+    """Pixels that are filled in would have none, and images in other units are not what it was trained on."""
+    policy, image = cfp.load("run"), torch.from_numpy(images())
+    soft = (image / 255 * 2 - 1).requires_grad_()
+    with pytest.raises(ValueError, match="observation must be uint8, got float32"):
+        policy(soft)
+    action = policy.actor(soft, True)
+    torch.testing.assert_close(action, policy.actor(image, True))
+    assert torch.autograd.grad(action.sum(), soft)[0].abs().sum() > 0
+
+
+def test_images_that_are_views_of_others() -> None:
+    """Mirrored ones, and read-only ones without a warning."""
+    policy, image = cfp.load("run"), np.random.default_rng(0).integers(0, 256, (3, 64, 64), np.uint8)
+    for view in (image[..., ::-1], np.broadcast_to(image, (2, 3, 64, 64))):
+        actions = [policy.predict(each, deterministic=True)[0] for each in (view, view.copy())]
+        assert np.array_equal(*actions)
+
+
 def test_description_stands_beside_and_inside_the_weights(saved):
     folder, _ = saved
     beside = json.loads((folder / "policy.json").read_text())

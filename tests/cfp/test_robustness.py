@@ -106,6 +106,17 @@ def test_every_case_has_its_starts_disturbance_and_particles(folder, made, tmp_p
     assert "mine on shapematch" in printed and all(f"| {name} | lite |" in printed for name in names)
 
 
+def test_different_policies_of_one_name_are_refused(folder, tmp_path, capsys):
+    """Each would replace the rows of the other in a table."""
+    other = tmp_path / "more" / "mine"
+    other.mkdir(parents=True)
+    config = sac_preset("shapematch")
+    save_actor(other / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    words = ["--episodes", "1", "--full", "0", "--disturbed", "0", "--device", "cpu"]
+    assert robustness.main([str(folder), str(other), *words]) == 2
+    assert "policies must have names of their own, got two called 'mine' on shapematch" in capsys.readouterr().err
+
+
 def test_rows_are_kept_until_the_policy_or_the_number_of_episodes_is_another(folder, made, tmp_path):
     table, short = tmp_path / "rows.csv", "--cases latency --episodes 2 --full 0 --disturbed 1"
     assert command(folder, table, short) == 0

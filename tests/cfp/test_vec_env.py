@@ -121,6 +121,12 @@ def test_options_that_differ_are_refused(others):
         env.reset()
 
 
+@pytest.mark.parametrize("steps", [-1, 0])  # -1 is no limit in Gymnasium
+def test_a_limit_of_no_steps_is_refused(steps):
+    with pytest.raises(ValueError, match=f"max_episode_steps must be at least 1, got {steps}"):
+        TorchVecEnv(FakeEnv(num_envs=2), max_episode_steps=steps)
+
+
 def test_episode_in_progress_can_be_put_back():
     env = TorchVecEnv(FakeEnv(num_envs=2, horizon=9))
     env.reset()

@@ -6,6 +6,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
@@ -61,6 +62,7 @@ def assert_reset(info: dict, start: dict) -> None:
     assert {"com", "object_com", "finite", "split"} <= set(start)
     assert all(np.array_equal(info[name], start[name]) for name in start)
     assert info["_com"].all() and info["_object_com"].all() and not info["_reward_terms/alive"].any()
+    assert not info["reward_terms/alive"].any()  # as in Gymnasium's own: the terms of all steps have the reward's sum
 
 
 def test_same_step_autoreset() -> None:
@@ -73,6 +75,16 @@ def test_same_step_autoreset() -> None:
     assert last[4]["final_info"]["reward_terms/alive"].tolist() == [4.0, 4.0]
     assert "final_obs" not in rows[4][4] and not rows[4][3].any()
     assert_reset(last[4], start)
+
+
+def test_final_infos_hold_what_ended_alone() -> None:
+    """As Gymnasium's own do, in which a mean over elements that go on would count them as well."""
+    vector = make_vec("grow", 3, autoreset_mode="SameStep")
+    vector.reset(seed=0)
+    vector.unwrapped.state.v[1] = torch.nan
+    final = vector.step(np.zeros(vector.action_space.shape, np.float32))[4]["final_info"]
+    assert final["_reward_terms/alive"].tolist() == [False, True, False]
+    assert final["reward_terms/failure"].tolist() == [0.0, -16.0, 0.0] and not final["com"][[0, 2]].any()
 
 
 def test_next_step_autoreset() -> None:

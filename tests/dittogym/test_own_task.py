@@ -268,6 +268,13 @@ def test_an_environment_is_made_again_from_the_json_of_its_specification(task: s
     gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
 
 
+def test_a_batch_is_made_again_from_the_json_of_its_specification() -> None:
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    batch = gymnasium.make_vec("dittogym/run-coarse-v0", 2, autoreset_mode=mode, **SMALL)
+    same = gymnasium.make_vec(gymnasium.envs.registration.EnvSpec.from_json(batch.spec.to_json()))
+    assert (same.num_envs, same.metadata) == (2, batch.metadata)
+
+
 def test_centres_may_be_lists_and_a_fixed_window_may_lie_anywhere() -> None:
     spec = changed(view=[None, 0.28], window=Window(left=0.1))
     assert spec.view == (None, 0.28)

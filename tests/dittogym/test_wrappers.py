@@ -43,6 +43,15 @@ def test_spaces(make, size: int, pixels: int) -> None:
     assert env.observation_space.contains(env.step(env.action_space.sample())[0])
 
 
+def test_ranges_and_stacks_of_the_wrappers_inside_are_kept() -> None:
+    stacked = observation_resolution(wrappers.FrameStackObservation(single(), 2), 16)
+    assert stacked.observation_space == gymnasium.spaces.Box(0, 255, (2, 3, 16, 16), np.uint8)
+    assert stacked.observation_space.contains(stacked.reset(seed=0)[0])
+    positive = action_resolution(wrappers.RescaleAction(single(), np.float32(0.0), np.float32(2.0)), 4)
+    assert positive.action_space == gymnasium.spaces.Box(0.0, 2.0, (2, 4, 4), np.float32)
+    assert positive.action(positive.action_space.high) == pytest.approx(np.full((2, 8, 8), 2.0), abs=1e-5)
+
+
 @pytest.mark.parametrize("size", [1, 3, 4, 8])
 def test_actions_are_enlarged_by_bicubic_interpolation(size: int) -> None:
     """A wrapped environment does what the bare one does with the enlarged action; the same for a batch."""
