@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 
 #: Rows of nodes kept around the window so that every 3x3 stencil has an address. Their velocity is zero: contributions
 #: to nodes outside the window are dropped.
@@ -15,6 +15,7 @@ PAD = 3
 LARGEST = 2**15
 
 
+@tree.register
 @dataclass(frozen=True)
 class Grid:
     """Square window of ``resolution`` x ``resolution`` nodes, node (i, j) at ``origin + (i, j) * spacing``.

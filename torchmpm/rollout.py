@@ -37,6 +37,7 @@ def repeated(
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
+        TypeError: With ``shared``, it or the state holds something that is no tree, such as a module.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
     times, segment = checks.whole("times", times, 0), checks.segment(segment)
@@ -44,6 +45,9 @@ def repeated(
         segment = max(times, 1)
     elif segment == "auto":
         segment = SEGMENT
+    if shared is not None:
+        tree.check_open("shared", shared)
+        tree.check_open("state", state)
     arguments = () if shared is None else (shared,)
     for start in range(0, times, segment):
         run = partial(_run, step, min(segment, times - start))

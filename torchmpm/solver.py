@@ -272,10 +272,10 @@ class Solver:
         return reason is None
 
     def _reads_scene_alone(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether a substep reads no tensors but those of the scene; custom materials and substeps may read others."""
+        """Whether a substep reads no tensors but those of the scene; custom parts of it may read others."""
         if self._replaced or torch.compiler.is_compiling():
             return False
-        return tree.is_open(self.bodies) and not self._has_tangents(state, *fields)
+        return tree.is_open((self.grid, self.bodies)) and not self._has_tangents(state, *fields)
 
     def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
