@@ -163,7 +163,8 @@ class ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
 
         Raises:
-            RuntimeError: ``mask`` is not bool, or its length or the sizes of ``other`` do not fit.
+            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes.
+            TypeError: ``mask`` is not a tensor.
         """
         return tree.where(mask, self, other)
 

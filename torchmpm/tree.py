@@ -141,9 +141,21 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
         other: A tree of the same structure and shapes.
+
+    Raises:
+        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure or shapes.
+        TypeError: ``mask`` is not a tensor.
     """
+    if not isinstance(mask, Tensor):
+        raise TypeError(f"mask must be a Tensor, got {type(mask).__name__}")
 
     def select(chosen: Tensor, otherwise: Tensor) -> Tensor:
+        if mask.dtype != torch.bool or mask.shape != chosen.shape[:1]:
+            expected = f"bool of shape {tuple(chosen.shape[:1])}"
+            raise ValueError(f"mask must be {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
+        if otherwise.shape != chosen.shape:
+            shapes = f"{tuple(chosen.shape)} and {tuple(otherwise.shape)}"
+            raise ValueError(f"other must be of the same shapes, got a tensor of shapes {shapes}")
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)
