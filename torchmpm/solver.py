@@ -316,15 +316,18 @@ class Solver:
         )
 
     def check_state(self, state: ParticleState) -> None:
-        """Raise an error unless this is a state of as many particles as the bodies have.
+        """Raise an error unless this is a state of as many particles as the bodies have, and gravity of its batch.
 
         Raises:
-            ValueError: It has another number of particles.
+            ValueError: It has another number of particles, or gravity that of another batch.
             TypeError: It has another type.
         """
         checks.instance("state", state, ParticleState)
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
+        batch, gravity = state.batch_size, self.gravity
+        if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
+            raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
 
     def _try_laws(self, state: ParticleState) -> None:
         """Before the first step, call each material of somebody else once, to see whether it returns what it must.
@@ -354,9 +357,6 @@ class Solver:
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
-        gravity = self.gravity
-        if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
-            raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
 
 
