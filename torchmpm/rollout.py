@@ -37,7 +37,8 @@ def repeated(
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
-        TypeError: With ``shared``, it or the state holds something that is no tree, such as a module.
+        TypeError: ``shared``, or the state beside it, holds something whose tensors checkpoints cannot see, such as a
+            module.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
     times, segment = checks.whole("times", times, 0), checks.segment(segment)
@@ -45,7 +46,7 @@ def repeated(
         segment = max(times, 1)
     elif segment == "auto":
         segment = SEGMENT
-    if shared is not None:
+    if shared is not None and segment < times:
         tree.check_open("shared", shared)
         tree.check_open("state", state)
     arguments = () if shared is None else (shared,)
