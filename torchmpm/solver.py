@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
@@ -225,7 +224,7 @@ class Solver:
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         self._try_laws(state)
         scene = self.scene(state, actuation, origin)
-        if self._reads_scene_alone(state, actuation, origin):
+        if self._reads_scene_alone:
             end = repeated(self.substep, state.components(), substeps, segment=segment, shared=scene)
         else:
             end = repeated(partial(self.substep, scene), state.components(), substeps, segment=segment)
@@ -271,16 +270,10 @@ class Solver:
             warn_eager("the physics", reason)
         return reason is None
 
-    def _reads_scene_alone(self, state: ParticleState, *fields: Tensor | None) -> bool:
+    @property
+    def _reads_scene_alone(self) -> bool:
         """Whether a substep reads no tensors but those of the scene; custom parts of it may read others."""
-        if self._replaced or torch.compiler.is_compiling():
-            return False
-        return tree.is_open((self.grid, self.bodies)) and not self._has_tangents(state, *fields)
-
-    def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
-        tensors = (*vars(state).values(), *fields, *self.constants.values())
-        return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
+        return not self._replaced and not torch.compiler.is_compiling() and tree.is_open((self.grid, self.bodies))
 
     def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
         """Why the kernels cannot run a step, or ``None`` if they can."""
@@ -288,7 +281,7 @@ class Solver:
             return f"it does not call {type(self).__name__}.{self._replaced}"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        if self._has_tangents(state, *fields):
+        if tree.has_tangents((*vars(state).values(), *fields, *self.constants.values())):
             return "it has no forward-mode derivatives"
         return self.kernels.unsupported(state.device)
 

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 Tree = TypeVar("Tree")
@@ -159,6 +160,11 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)
+
+
+def has_tangents(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether one of the ``tensors`` carries a tangent of ``torch.autograd.forward_ad``."""
+    return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
 
 
 def transforming() -> bool:
