@@ -84,8 +84,10 @@ def trajectory(
         The final state and the list of outputs, one per input.
 
     Raises:
+        ValueError: ``checkpointed`` is not True or False.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
+    checks.flag("checkpointed", checkpointed)
     outputs = []
     for value in inputs:
         state = _checkpointed(step, state, value) if checkpointed and _records() else step(state, value)

@@ -24,6 +24,7 @@ from torchmpm import (
     lame,
     repeated,
     sampling,
+    trajectory,
 )
 
 NAN, INF, SQUARE = math.nan, math.inf, np.zeros((3, 2))
@@ -134,6 +135,7 @@ VALUES = {
     "backend": [lambda b=b: solver(backend=b) for b in (None, "compile")],
     "substeps": [lambda n=n: step(substeps=n) for n in (1.5, -1)],
     "segment": [lambda n=n: repeated(torch.sin, torch.ones(1), 3, segment=n) for n in (0, -3, True, "all")],
+    "checkpointed": [lambda: trajectory(torch.add, torch.ones(1), [1], observe=id, checkpointed="no")],
     "times": [lambda: repeated(torch.sin, torch.ones(1), -1)],
     "state has": [
         lambda: step(lively(6)),
