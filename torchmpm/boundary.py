@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.grid import PAD, Grid
 
 #: Inclusive range of node indices; ``None`` at an end leaves it open.
@@ -82,6 +82,7 @@ def fixed(
     return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class Face:
     """All rules against one direction, as masks over the padded grid for the current position of the window."""

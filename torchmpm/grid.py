@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 
 #: Rows of nodes kept around the window so that every 3x3 stencil has an address. Their velocity is zero: contributions
 #: to nodes outside the window are dropped.
@@ -15,6 +15,7 @@ PAD = 3
 LARGEST = 2**15
 
 
+@tree.register
 @dataclass(frozen=True)
 class Grid:
     """Square window of ``resolution`` x ``resolution`` nodes, node (i, j) at ``origin + (i, j) * spacing``.
@@ -24,7 +25,8 @@ class Grid:
     Attributes:
         resolution: Nodes per axis.
         spacing: Distance h between nodes in m; ``None`` means ``1 / resolution`` (a window of one metre).
-        margin: Particles closer than this to the left or right end of the window (m) take no part.
+        margin: Particles closer than this to the left or right end of the window (m) take no part. Without a wall, half
+            a cell keeps out those of the left end that could be thrown around, as nodes can have negative mass there.
 
     Raises:
         ValueError: ``resolution`` is not a whole number from 4 to 32,768, ``spacing`` is not positive, or ``margin``

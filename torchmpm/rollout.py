@@ -37,6 +37,8 @@ def repeated(
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
+        TypeError: ``shared``, or the state beside it, holds something whose tensors checkpoints cannot see, such as a
+            module.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
     times, segment = checks.whole("times", times, 0), checks.segment(segment)
@@ -45,12 +47,18 @@ def repeated(
     elif segment == "auto":
         segment = SEGMENT
     arguments = () if shared is None else (shared,)
+    checkpointed = _checkpointed
+    if shared is not None and segment < times:
+        tree.check_open("shared", shared)
+        tree.check_open("state", state)
+        if not tree.has_tangents(tree.leaves((shared, state))):
+            checkpointed = _replayed
     for start in range(0, times, segment):
         run = partial(_run, step, min(segment, times - start))
         if segment >= times:
             state = run(*arguments, state)
         else:
-            state = _checkpointed(run, state) if shared is None else _replayed(run, shared, state)
+            state = checkpointed(run, *arguments, state)
     return state
 
 
@@ -76,8 +84,10 @@ def trajectory(
         The final state and the list of outputs, one per input.
 
     Raises:
+        ValueError: ``checkpointed`` is not True or False.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
     """
+    checks.flag("checkpointed", checkpointed)
     outputs = []
     for value in inputs:
         state = _checkpointed(step, state, value) if checkpointed and _records() else step(state, value)
@@ -138,7 +148,10 @@ def _close(found: Any, expected: Any) -> bool:
 
 
 def _replayed(function: Callable[..., State], *arguments: Any) -> State:
-    """As :func:`_checkpointed`, in half the time, of a function that reads no tensors but those of its arguments."""
+    """As :func:`_checkpointed`, in half the time, of a function that reads no tensors but those of its arguments.
+
+    It has no forward-mode derivatives.
+    """
     tensors, rebuild = tree.flatten(tree.without_inference(arguments))
     structure: list[Callable[..., State]] = []
 

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
@@ -225,7 +224,7 @@ class Solver:
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         self._try_laws(state)
         scene = self.scene(state, actuation, origin)
-        if self._reads_scene_alone(state, actuation, origin):
+        if self._reads_scene_alone:
             end = repeated(self.substep, state.components(), substeps, segment=segment, shared=scene)
         else:
             end = repeated(partial(self.substep, scene), state.components(), substeps, segment=segment)
@@ -271,16 +270,10 @@ class Solver:
             warn_eager("the physics", reason)
         return reason is None
 
-    def _reads_scene_alone(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether a substep reads no tensors but those of the scene; custom materials and substeps may read others."""
-        if self._replaced or torch.compiler.is_compiling():
-            return False
-        return tree.is_open(self.bodies) and not self._has_tangents(state, *fields)
-
-    def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
-        tensors = (*vars(state).values(), *fields, *self.constants.values())
-        return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
+    @property
+    def _reads_scene_alone(self) -> bool:
+        """Whether a substep reads no tensors but those of the scene; custom parts of it may read others."""
+        return not self._replaced and not torch.compiler.is_compiling() and tree.is_open((self.grid, self.bodies))
 
     def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
         """Why the kernels cannot run a step, or ``None`` if they can."""
@@ -288,7 +281,7 @@ class Solver:
             return f"it does not call {type(self).__name__}.{self._replaced}"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        if self._has_tangents(state, *fields):
+        if tree.has_tangents((*vars(state).values(), *fields, *self.constants.values())):
             return "it has no forward-mode derivatives"
         return self.kernels.unsupported(state.device)
 
@@ -316,15 +309,18 @@ class Solver:
         )
 
     def check_state(self, state: ParticleState) -> None:
-        """Raise an error unless this is a state of as many particles as the bodies have.
+        """Raise an error unless this is a state of as many particles as the bodies have, and gravity of its batch.
 
         Raises:
-            ValueError: It has another number of particles.
+            ValueError: It has another number of particles, or gravity that of another batch.
             TypeError: It has another type.
         """
         checks.instance("state", state, ParticleState)
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
+        batch, gravity = state.batch_size, self.gravity
+        if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
+            raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
 
     def _try_laws(self, state: ParticleState) -> None:
         """Before the first step, call each material of somebody else once, to see whether it returns what it must.
@@ -354,9 +350,6 @@ class Solver:
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
-        gravity = self.gravity
-        if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
-            raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
 
 

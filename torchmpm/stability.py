@@ -18,10 +18,13 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     It holds for any arrangement of particles: the strain rate C of a particle cannot exceed what the kinetic energy of
     its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that.
     """
+    checks.entries("actuation", actuation)
     rates, pull = [0.0], torch.as_tensor(detached_column(actuation), dtype=torch.float64, device="cpu").abs()
     for k, body in enumerate(bodies):
+        own = body.material.stiffness()
+        checks.value(f"stiffness() of bodies[{k}].material", own)
         try:
-            stiffness = detached_column(body.material.stiffness())
+            stiffness = detached_column(own)
             if body.muscle:
                 stiffness = stiffness + 2.0 * pull
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)

@@ -25,7 +25,8 @@ class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
 
     The solver stores each component of a vector or matrix contiguously behind these shapes (strides, not copies),
-    because its arithmetic runs over whole components.
+    because its arithmetic runs over whole components. A field of a result therefore holds the memory of all: keep
+    or save ``state.x.clone()`` where that is all you need of many states.
 
     Attributes:
         x: (B, N, 2) positions in the world, m.
@@ -163,7 +164,8 @@ class ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
 
         Raises:
-            RuntimeError: ``mask`` is not bool, or its length or the sizes of ``other`` do not fit.
+            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes.
+            TypeError: ``mask`` is not a tensor.
         """
         return tree.where(mask, self, other)
 

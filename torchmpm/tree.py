@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 Tree = TypeVar("Tree")
@@ -72,7 +73,28 @@ def leaves(tree: Any) -> list[Tensor]:
 
 def is_open(tree: Any) -> bool:
     """Whether all leaves of a tree are tensors, numbers, texts or None, so that none hides tensors of its own."""
-    return all(isinstance(leaf, Tensor | int | float | str | None) for leaf in pytree.tree_leaves(tree))
+    return _closed(tree) is None
+
+
+def check_open(name: str, tree: Any) -> None:
+    """Raise a TypeError unless :func:`is_open`: derivatives in tensors that a leaf hides would be lost.
+
+    Args:
+        name: What the tree is, for the message.
+        tree: The tree.
+    """
+    closed = _closed(tree)
+    if closed is not None:
+        raise TypeError(
+            f"{name} must hold tensors, numbers, texts and containers of them alone, got a {type(closed).__name__}: "
+            "register a dataclass with torchmpm.tree.register, and give the tensors of other objects"
+        )
+
+
+def _closed(tree: Any) -> Any:
+    """The first leaf that could hide tensors, or ``None``."""
+    leaves = pytree.tree_leaves(tree)
+    return next((leaf for leaf in leaves if not isinstance(leaf, Tensor | int | float | str | None)), None)
 
 
 def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree]]:
@@ -120,12 +142,29 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
         other: A tree of the same structure and shapes.
+
+    Raises:
+        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure or shapes.
+        TypeError: ``mask`` is not a tensor.
     """
+    if not isinstance(mask, Tensor):
+        raise TypeError(f"mask must be a Tensor, got {type(mask).__name__}")
 
     def select(chosen: Tensor, otherwise: Tensor) -> Tensor:
+        if mask.dtype != torch.bool or mask.shape != chosen.shape[:1]:
+            expected = f"bool of shape {tuple(chosen.shape[:1])}"
+            raise ValueError(f"mask must be {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
+        if otherwise.shape != chosen.shape:
+            shapes = f"{tuple(chosen.shape)} and {tuple(otherwise.shape)}"
+            raise ValueError(f"other must be of the same shapes, got a tensor of shapes {shapes}")
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)
+
+
+def has_tangents(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether one of the ``tensors`` carries a tangent of ``torch.autograd.forward_ad``."""
+    return not transforming() and any(t is not None and unpack_dual(t).tangent is not None for t in tensors)
 
 
 def transforming() -> bool:

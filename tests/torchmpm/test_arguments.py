@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from torchmpm import (
     lame,
     repeated,
     sampling,
+    trajectory,
 )
 
 NAN, INF, SQUARE = math.nan, math.inf, np.zeros((3, 2))
@@ -58,6 +59,27 @@ class Alone(Elastic):
 
     def return_map(self, F: Any, Jp: Tensor) -> Any:
         return F
+
+
+class Single(Elastic):
+    """A law in single precision, which would round the state."""
+
+    def return_map(self, F: Any, Jp: Tensor) -> Any:
+        return tuple(component.float() for component in F), Jp
+
+
+class Endless(Elastic):
+    """A law whose stiffness is not returned."""
+
+    def stiffness(self) -> Any:
+        pass
+
+
+@dataclass
+class Hidden:
+    """A container that is not registered as a tree."""
+
+    x: Tensor
 
 
 #: What the error names, and calls that must raise it.
@@ -105,6 +127,7 @@ VALUES = {
         *(lambda g=g: solver(gravity=torch.zeros(g)) for g in ((), (3,), (5, 5), (1, 1, 2), 0, (0, 2))),
         *(lambda g=g: solver(gravity=g) for g in (torch.zeros(2) * 1j, torch.zeros(2) == 1, torch.tensor([0.0, NAN]))),
         lambda: solver(gravity=torch.zeros(3, 2)).step(lively(5, 2)),
+        lambda: diagnostics.potential_energy(solver(gravity=torch.zeros(3, 2)), lively(5)),
     ],
     "damping": [lambda d=d: solver(damping=d) for d in (1e30, -1)],
     "dt": [lambda dt=dt: solver(dt=dt) for dt in (INF, NAN, 0.0, 0.1)],
@@ -112,13 +135,19 @@ VALUES = {
     "backend": [lambda b=b: solver(backend=b) for b in (None, "compile")],
     "substeps": [lambda n=n: step(substeps=n) for n in (1.5, -1)],
     "segment": [lambda n=n: repeated(torch.sin, torch.ones(1), 3, segment=n) for n in (0, -3, True, "all")],
+    "checkpointed": [lambda: trajectory(torch.add, torch.ones(1), [1], observe=id, checkpointed="no")],
     "times": [lambda: repeated(torch.sin, torch.ones(1), -1)],
     "state has": [
         lambda: step(lively(6)),
         lambda: step(ParticleState.at_rest(torch.zeros(1, 0, 2))),
         lambda: diagnostics.mass(solver(), lively(3)),
     ],
-    "actuation": [lambda a=a: step(lively(5), a) for a in (FIELD[:, :1], FIELD.float(), FIELD.to("meta"))],
+    "actuation": [
+        *(lambda a=a: step(lively(5), a) for a in (FIELD[:, :1], FIELD.float(), FIELD.to("meta"))),
+        *(lambda a=a: robot(5).stable_dt(a) for a in (NAN, "strong", torch.tensor([1.0, INF]))),
+    ],
+    "stiffness() of bodies[0].material": [lambda: solver(bodies=(body(material=Endless(300.0, 80.0)),))],
+    "other": [lambda s=s: lively(5).where(torch.tensor([True]), s) for s in (lively(5, 3), lively(4))],
     "origin": [lambda: step(origin=torch.zeros(2).double())],
     "x": [
         *(lambda s=s: state(x=torch.zeros(s)) for s in ((5, 3), (5,), (2, 5, 1), (1, 2, 5, 2))),
@@ -142,8 +171,12 @@ VALUES = {
     "radius": [lambda: sampling.disc(SQUARE, (0, 0), -1.0)],
     "size": [lambda: sampling.box(SQUARE, (0, 0), (1, -1))],
     "mask": [
-        lambda m=m: sampling.image(SQUARE, m, (0, 0), (1, 1))
-        for m in (np.ones(3, bool), np.full((2, 2), NAN), np.zeros((3, 3), bool))
+        *(
+            lambda m=m: sampling.image(SQUARE, m, (0, 0), (1, 1))
+            for m in (np.ones(3, bool), np.full((2, 2), NAN), np.zeros((3, 3), bool))
+        ),
+        lambda: lively(5).where(torch.ones(1), lively(5)),
+        *(lambda n=n: lively(5).where(torch.ones(n) > 0, lively(5)) for n in (3, (1, 5))),
     ],
     "cells": [lambda c=c: sampling.lattice(c, (0, 0), (1, 1)) for c in ((3,), None, (10**9, 10**9))],
 }
@@ -156,13 +189,17 @@ TYPES = {
         lambda: step(torch.zeros(1, 5, 2)),
         lambda: diagnostics.elastic_energy(solver(), 5),
         lambda: diagnostics.impulses(solver(), "x"),
+        lambda: repeated(lambda _, s: s, Hidden(torch.ones(1)), 3, segment=1, shared=torch.ones(1)),
     ],
     "solver": [lambda: diagnostics.momentum(None, lively(5))],
     "x": [lambda x=x: ParticleState.at_rest(x) for x in (np.zeros((5, 2)), torch.zeros(1, 5, 2).to_sparse())],
     "actuation": [lambda: step(lively(5), FIELD.to_sparse())],
+    "mask": [lambda: lively(5).where([True], lively(5))],
+    "shared": [lambda: repeated(lambda net, x: net(x), torch.ones(1), 3, segment=1, shared=torch.nn.Linear(1, 1))],
     "origin": [lambda: step(origin=[0.0, 0.0])],
     "stress of Averaged": [lambda: solver(bodies=(body(material=Averaged(300.0, 80.0)),)).step(lively(5, 2))],
     "return_map of Alone": [lambda: solver(bodies=(body(material=Alone(300.0, 80.0)),)).step(lively(5, 2))],
+    "return_map of Single": [lambda: solver(bodies=(body(material=Single(300.0, 80.0)),)).step(lively(5, 2))],
 }
 CASES = [
     (error, name, call)

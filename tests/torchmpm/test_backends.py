@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -91,6 +92,23 @@ def test_subclasses_are_heard(name: str, fresh_process: None, caplog: pytest.Log
         assert name in message
         with pytest.raises(ValueError, match=name):
             kind(grid, (body,), backend="native").step(state)
+
+
+class Softened(VonMises):
+    """A law that works in place."""
+
+    def return_map(self, F: Any, Jp: Tensor) -> Any:
+        """One stretch and Jp are changed."""
+        return (F[0].mul_(0.9), *F[1:]), Jp.mul_(0.5)
+
+
+def test_a_law_may_work_in_place() -> None:
+    """Also in the first step, before which it is tried."""
+    state, body = lively(30), Body(30, Softened(500.0, 50.0, 60.0))
+    copy = state.clone()
+    result = robot(30, bodies=(body,), backend="eager").step(state)
+    assert_identical(state, copy)
+    assert torch.equal(result.Jp, 0.5 * copy.Jp)
 
 
 @pytest.mark.parametrize("backend", ["auto", "eager"])

@@ -11,6 +11,7 @@ import torch
 from peak_memory import PeakMemory
 from scenes import lively, normal, robot
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchmpm import Body, Elastic, ParticleState, Solver, repeated, trajectory
 from torchmpm.backends import compiler_found
@@ -176,6 +177,17 @@ def test_tensors_that_a_closure_reads(loop: str) -> None:
     offset.add_(0.5)
     with pytest.raises(RuntimeError, match=CHANGED):
         final.sum().backward()
+
+
+def test_forward_mode_derivatives_of_checkpoints() -> None:
+    gain, x = torch.tensor(0.7, requires_grad=True), torch.ones(2)
+    found = []
+    for options in ({}, {"segment": 2}):
+        with forward_ad.dual_level():
+            start = forward_ad.make_dual(x, torch.tensor([1.0, 2.0]))
+            end = repeated(lambda gain, s: (gain * s).sin(), start, 4, shared=gain, **options)
+            found.append(forward_ad.unpack_dual(end).tangent)
+    torch.testing.assert_close(*found)
 
 
 def test_a_state_that_is_no_number_is_replayed() -> None:

@@ -37,23 +37,27 @@ class Material(Protocol):
 
 
 def try_law(material: Material, F: Mat2, Jp: Tensor) -> None:
-    """Call a material once, with components (B, N), and raise a TypeError unless it returns as many of that shape."""
+    """Call a material once, with components (B, N), and raise a TypeError unless it returns as many of their kind.
+
+    Of another shape they could broadcast, and of another dtype they would convert the state.
+    """
     with torch.no_grad():
-        returned: Any = material.return_map(F, Jp)
-        if _shape_of(returned) != _shape_of((F, Jp)):
-            allowed = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
-            raise TypeError(f"return_map of {type(material).__name__} must return {allowed}, got {_shape_of(returned)}")
-        stress = material.stress(returned[0], Jp)
-        if _shape_of(stress) != _shape_of((Jp,) * 3):
-            allowed = f"three tensors of shape {tuple(Jp.shape)}"
-            raise TypeError(f"stress of {type(material).__name__} must return {allowed}, got {_shape_of(stress)}")
+        a, b, c, d = (component.clone() for component in F)  # the law may change them in place
+        returned: Any = material.return_map((a, b, c, d), Jp.clone())
+        if _kind_of(returned) != _kind_of((F, Jp)):
+            allowed = f"(F, Jp), four tensors and one, all {_kind_of(Jp)}"
+            raise TypeError(f"return_map of {type(material).__name__} must return {allowed}, got {_kind_of(returned)}")
+        stress = material.stress(returned[0], Jp.clone())
+        if _kind_of(stress) != _kind_of((Jp,) * 3):
+            allowed = f"three tensors, all {_kind_of(Jp)}"
+            raise TypeError(f"stress of {type(material).__name__} must return {allowed}, got {_kind_of(stress)}")
 
 
-def _shape_of(given: Any) -> str:
-    """Of tensors and tuples of them."""
+def _kind_of(given: Any) -> str:
+    """Types and shapes of tensors and tuples of them."""
     if isinstance(given, tuple):
-        return f"({', '.join(map(_shape_of, given))})"
-    return f"shape {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
+        return f"({', '.join(map(_kind_of, given))})"
+    return f"{given.dtype} of shape {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
 
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
