@@ -308,12 +308,12 @@ def highest(evaluations: Iterable[Row]) -> Row:
 
 
 def refined_run() -> str:
-    """Returns of policies of RUN before a refinement on whole episodes and at its highest evaluation, by seed."""
-    refined = [row for row in read("run-seeds.csv") if " on whole episodes" in row["changed"]]
+    """Returns of policies of RUN before they were refined and at the highest evaluation of that training, by seed."""
     cells = []
-    for (changed, seed), (before, *later) in trainings(refined, "changed", "seed").items():
-        ends = (f"{number(row['mean'])} ({share(row['success'])})" for row in (before, highest(later)))
-        cells.append({"changed": changed.replace(" on whole episodes", ""), "seed": seed, "cell": " → ".join(ends)})
+    for (changed, seed), (before, *later) in trainings(read("run-seeds.csv"), "changed", "seed").items():
+        if "refined" in changed:
+            ends = (f"{number(row['mean'])} ({share(row['success'])})" for row in (before, highest(later)))
+            cells.append({"changed": changed, "seed": seed, "cell": " → ".join(ends)})
     heads, lines = pivot(cells, ("changed",), ("seed",), "cell")
     return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), lines)
 
