@@ -165,8 +165,7 @@ def _numbers(result: Result) -> Row:
     """The other columns."""
     returns = (result.mean, result.interval, result.std, min(result.returns), max(result.returns))
     shares = (result.success, result.success_whole, result.torn, result.piece, result.mean_piece)
-    texts = ["" if value is None else f"{value:.1f}" for value in returns]
-    texts += ["" if value is None else f"{value:.3f}" for value in shares]
+    texts = ["" if value is None else f"{value:.3f}" for value in (*returns, *shares)]
     return dict(zip(RETURNS + SHARES, texts, strict=True))
 
 

@@ -102,6 +102,7 @@ def test_every_case_has_its_starts_disturbance_and_particles(folder, made, tmp_p
     sizes = {(played[id(row)].conditions.grid, played[id(row)].action_resolution) for row in own[:-1]}
     assert sizes == {(32, 64)}
     assert len({row["mean"] for row in rows}) > len(rows) / 2
+    assert {len(row["mean"].partition(".")[2]) for row in rows} == {3}  # ratios of small rewards are made from them
     printed = capsys.readouterr().out
     assert "mine on shapematch" in printed and all(f"| {name} | lite |" in printed for name in names)
 
