@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 import tyro
 
-from cfp.config import RunConfig
+from cfp.config import RunConfig, check_task
 from cfp.errors import ConfigError, check_at_least
 from cfp.evaluate import open_policy
 from cfp.evaluation.returns import Result, UntrainedPolicy, decision_grid, evaluate, make_trial, without_noise
@@ -255,6 +255,8 @@ def run(command: Command) -> None:
     """Evaluate, put the rows into their table, and print what they say of each policy."""
     command.check()
     plans = [plan(command, given) for given in command.policies]
+    for evaluations in plans:
+        check_task(evaluations[0].config.task)  # the module of a later policy may have replaced it
     check_names([each for evaluations in plans for each in evaluations])
     rows = read_rows(command.rows)
     for evaluations in plans:
