@@ -197,7 +197,8 @@ def rankings(results: Iterable[dict[str, Any]]) -> list[Table]:
 
 def run(command: Command) -> None:
     """Evaluate and rank."""
-    results = [read_results(Path(name)) for name in command.policies if name.endswith(".json")]
+    paths = [Path(name) for name in command.policies if name.endswith(".json")]
+    results = {path.resolve(): read_results(path) for path in paths}  # a policy counts once
     names = [name for name in command.policies if not name.endswith(".json")]
     found = [candidate for name in names for candidate in candidates(name, command.tasks)]
     hashes: dict[tuple[str, str], str | None] = {}
@@ -212,8 +213,8 @@ def run(command: Command) -> None:
         path = command.out / f"{row['task']}-{row['policy']}.json"
         write_json(path, row)
         print(f"{path}: {json.dumps(row['scores'])}", flush=True)
-        results.append(row)
-    print("\n\n".join(table.to_markdown() for table in rankings(results)))
+        results[path.resolve()] = row
+    print("\n\n".join(table.to_markdown() for table in rankings(results.values())))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

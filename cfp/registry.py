@@ -28,7 +28,8 @@ OTHER_NAMES: dict[str, str] = {}
 def find(name: str) -> type[Learner]:
     """The class of an algorithm; a `ConfigError` if there is none of that name."""
     if name not in ALGORITHMS:
-        raise ConfigError(OTHER_NAMES.get(name, f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}"))
+        hint = "" if OTHER_NAMES else "; baselines.fit and baselines.Run know others"  # it has not been imported
+        raise ConfigError(OTHER_NAMES.get(name, f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}{hint}"))
     module, _, attribute = ALGORITHMS[name].partition(":")
     algorithm: type[Learner] = getattr(import_module(module), attribute)
     return algorithm

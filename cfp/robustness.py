@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 import tyro
 
-from cfp.config import RunConfig
+from cfp.config import RunConfig, check_task
 from cfp.errors import ConfigError, check_at_least
 from cfp.evaluate import open_policy
 from cfp.evaluation.returns import Result, UntrainedPolicy, decision_grid, evaluate, make_trial, without_noise
@@ -165,8 +165,7 @@ def _numbers(result: Result) -> Row:
     """The other columns."""
     returns = (result.mean, result.interval, result.std, min(result.returns), max(result.returns))
     shares = (result.success, result.success_whole, result.torn, result.piece, result.mean_piece)
-    texts = ["" if value is None else f"{value:.1f}" for value in returns]
-    texts += ["" if value is None else f"{value:.3f}" for value in shares]
+    texts = ["" if value is None else f"{value:.3f}" for value in (*returns, *shares)]
     return dict(zip(RETURNS + SHARES, texts, strict=True))
 
 
@@ -256,6 +255,8 @@ def run(command: Command) -> None:
     """Evaluate, put the rows into their table, and print what they say of each policy."""
     command.check()
     plans = [plan(command, given) for given in command.policies]
+    for evaluations in plans:
+        check_task(evaluations[0].config.task)  # the module of a later policy may have replaced it
     check_names([each for evaluations in plans for each in evaluations])
     rows = read_rows(command.rows)
     for evaluations in plans:

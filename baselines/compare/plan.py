@@ -15,6 +15,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.run import check_options
 from cfp.files import read_json, write_json
 from cfp.train import from_python
+from dittogym.tasks import task_name
 
 #: Options of a command line by name, with underscores.
 Options = dict[str, Any]
@@ -179,10 +180,15 @@ def make_runs(
             raise ConfigError(
                 f"{name} must be one or more different values, got {' '.join(map(str, values)) or 'none'}"
             )
+    for label in labels:
+        if Path(label).name != label:  # its folder would be elsewhere
+            raise ConfigError(f"algos must be names without a path, got {label!r}")
     for seed in seeds:
         if not 0 <= seed <= LARGEST_SEED:
             raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
-    for part, names, given in (("tasks", plan["tasks"], tasks), ("algos", plan["algos"], labels)):
+    parts = [("tasks", plan["tasks"], tasks), ("algos", plan["algos"], labels)]
+    parts += [(f"algos.{label}.tasks", own.get("tasks", {}), tasks) for label, own in plan["algos"].items()]
+    for part, names, given in parts:
         if unused := sorted(names.keys() - set(given)):
             print(f"plan: {part} {', '.join(unused)} are not in this comparison")
     found: dict[tuple[str, str], Options] = {}
@@ -191,6 +197,8 @@ def make_runs(
             options = _options(plan, label, task, {"preset": preset, "device": device})
             try:
                 if options["algo"] in REFERENCE_POLICIES:
+                    if useless := sorted(plan["algos"].get(label, {}).keys() - {"algo"}):
+                        raise ConfigError(f"{useless[0]} must not be under algos.{label}, which is not trained")
                     reference_config(options)
                 elif hasattr(resolved(options), "steps") and steps is not None:
                     options.setdefault("steps", steps)
@@ -198,12 +206,20 @@ def make_runs(
             except ConfigError as error:
                 raise ConfigError(f"{label} on {task}: {error}") from error
             found[task, label] = options
-    return [
-        Run(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task.split(':')[-1]}-{preset}-{seed}")
+    runs = [
+        Run(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task_name(task)}-{preset}-{seed}")
         for seed in seeds
         for (task, label), options in found.items()
         if seed == seeds[0] or options["algo"] not in REFERENCE_POLICIES
     ]
+    places: dict[Path, Run] = {}
+    for run in runs:  # as those of tasks of one name in two modules; the results of one would count for both
+        if (other := places.setdefault(run.folder, run)) is not run:
+            raise ConfigError(
+                f"tasks and algos must not share folders, but {other.label} on {other.task} and {run.label} on "
+                f"{run.task} are both named {run.name}"
+            )
+    return runs
 
 
 def _options(plan: dict[str, Any], label: str, task: str, given: Options) -> Options:

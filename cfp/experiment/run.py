@@ -42,6 +42,9 @@ from cfp.policy import copy_policy, read_policy
 from cfp.tables import CSVTable
 from dittogym.render.frame import png
 
+#: What a finished run says of its policy.
+REPORT = ("results.json", "index.html", "curve.png", "video.mp4", "replay.html")
+
 
 def check_options(config: RunConfig) -> None:
     """Check all that can be checked before anything is written."""
@@ -177,7 +180,8 @@ class TrainingRun:
         # A process killed after the last step but before the last evaluation still has to evaluate.
         if not stage.steps_left and not evaluation.is_missing:
             return
-        (self.folder / "results.json").unlink(missing_ok=True)  # of an earlier end of the run
+        for name in REPORT:  # of an earlier end of the run
+            (self.folder / name).unlink(missing_ok=True)
         callbacks = CallbackList(
             [
                 bar,

@@ -28,6 +28,8 @@ from torchmpm import checks
 TASKS: dict[str, Callable[..., TaskSpec]] = {
     make.__name__: make for make in (shapematch, run, grow, kick, dig, obstacle, catch, slot)
 }
+#: Module of the function that a ``"MODULE:NAME"`` stood for at first; another one in its place is another task.
+_defined_in: dict[str, str | None] = {}
 
 
 def task_name(task: str) -> str:
@@ -63,10 +65,20 @@ def check_task(task: object) -> None:
             except Exception as error:  # whatever the module does
                 reason = f" (module {module!r}: {type(error).__name__}: {error})"
             else:
-                reason = "" if name in TASKS else f" (module {module!r} does not register {name!r})"
+                reason = _registration_fault(task, module, name)
         if not reason and name in TASKS:
             return
     raise ValueError(f"task must be one of {', '.join(sorted(TASKS))} or MODULE:NAME{reason}, got {task!r}")
+
+
+def _registration_fault(task: str, module: str, name: str) -> str:
+    """What is wrong with a task whose module has been imported; empty if nothing is."""
+    if name not in TASKS:
+        return f" (module {module!r} does not register {name!r})"
+    where = getattr(TASKS[name], "__module__", None)
+    if _defined_in.setdefault(task, where) != where:
+        return f" (module {where!r} has registered another {name!r} since; give it a name of its own)"
+    return ""
 
 
 def make_spec(

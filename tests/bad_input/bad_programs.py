@@ -178,6 +178,7 @@ OTHERS = (
         planned({"common": {"seed": 5}}, "plan: common must not hold seed"),
         planned({"algos": {"cfp-sac": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp-sac.t"),
         planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "colour"),
+        planned({"algos": {"zero": {"steps": 5}}}, "steps must not be under algos.zero, which is not trained"),
         Case(
             "evaluate an empty folder",
             command(main_of("cfp.evaluate"), "{folder}"),

@@ -308,10 +308,12 @@ def test_the_narrower_section_of_a_plan_wins():
 
 
 def test_names_in_a_plan_that_mean_nothing_are_reported(capsys):
-    runs_of({"tasks": {"rnu": {}}, "algos": {"shca": {"steps": 480}}}, "shac")
+    algos = {"shca": {"steps": 480}, "shac": {"tasks": {"run": {}, "rnu": {"steps": 480}}}}
+    runs_of({"tasks": {"rnu": {}}, "algos": algos}, "shac")
     assert capsys.readouterr().out.splitlines() == [
         "plan: tasks rnu are not in this comparison",
         "plan: algos shca are not in this comparison",
+        "plan: algos.shac.tasks rnu are not in this comparison",
     ]
 
 
@@ -330,12 +332,20 @@ def test_options_become_words():
         ("--address head:6379", "address requires --executor ray, got head:6379"),
         ("--executor ray --workers 2", "workers requires --executor local"),
         ("--algos mpc other", "plan: algos.other must not hold target"),
+        ("--algos ../zero", "algos must be names without a path, got '../zero'"),
     ],
 )
 def test_wrong_options_are_named(tmp_path, capsys, options, message):
     plan = {"algos": {"other": {"algo": "mpc", "target": "M"}}} if "other" in options else PLAN
     assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_tasks_of_one_name_in_two_modules_are_refused(monkeypatch):
+    """They would have one folder, and the results of one of them would stand in the rows of both."""
+    monkeypatch.setattr("baselines.compare.plan.reference_config", lambda options: None)
+    with pytest.raises(ConfigError, match="zero on first:hop and zero on second:hop are both named zero-hop-quick-0"):
+        make_runs(read_plan(None), ["first:hop", "second:hop"], ["zero"], [0], Path("runs"))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "docs").glob("compare-plan*.json")), ids=lambda path: path.stem)

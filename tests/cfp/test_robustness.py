@@ -2,7 +2,9 @@
 
 import csv
 from dataclasses import replace
+from unittest import mock
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,7 @@ from cfp.evaluate import open_policy
 from cfp.evaluation.returns import Played, Result
 from cfp.presets import preset, sac_preset
 from cfp.robustness import DISTURBANCES, choose, effective, ratios
-from dittogym import Conditions, TorchEnv, make_spec
+from dittogym import TASKS, Conditions, TorchEnv, make_spec
 
 
 def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out():
@@ -102,6 +104,7 @@ def test_every_case_has_its_starts_disturbance_and_particles(folder, made, tmp_p
     sizes = {(played[id(row)].conditions.grid, played[id(row)].action_resolution) for row in own[:-1]}
     assert sizes == {(32, 64)}
     assert len({row["mean"] for row in rows}) > len(rows) / 2
+    assert {len(row["mean"].partition(".")[2]) for row in rows} == {3}  # ratios of small rewards are made from them
     printed = capsys.readouterr().out
     assert "mine on shapematch" in printed and all(f"| {name} | lite |" in printed for name in names)
 
@@ -170,6 +173,22 @@ def test_policy_for_another_control_step_is_refused(folder, tmp_path, capsys):
     save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
     assert command(folder, tmp_path / "rows.csv") == 2
     assert "policies must be a policy for environment steps of 0.01 s, got 0.005" in capsys.readouterr().err
+
+
+def test_policies_of_two_tasks_of_one_name_are_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(tmp_path)
+    files = [tmp_path / f"{module}.safetensors" for module in ("first_slope", "second_slope")]
+    config = sac_preset("run")
+    for file in files:
+        file.with_suffix(".py").write_text(
+            "import dataclasses, dittogym\n"
+            "def slope(): return dataclasses.replace(dittogym.make_spec('run'), name='slope')\n"
+            "dittogym.register('slope', slope)"
+        )
+        save_actor(file, build_actor(config.actor_spec(1)), replace(config, task=f"{file.stem}:slope"), 1, 0)
+    with mock.patch.dict(TASKS), mock.patch.dict(gymnasium.registry):
+        assert robustness.main([*map(str, files), "--device", "cpu"]) == 2
+    assert "module 'second_slope' has registered another 'slope' since" in capsys.readouterr().err
 
 
 def test_table_must_be_one_of_evaluations(folder, tmp_path, capsys):

@@ -12,7 +12,7 @@ from tiny_runs import TINY, assert_same_run
 from watching import at_step, interrupt
 
 import cfp
-from cfp import train
+from cfp import registry, train
 from cfp.policy import read_policy
 from cfp.tables import read_table
 
@@ -115,6 +115,13 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
     (tmp_path / "results.json").write_text('[{"policy": ')
     with pytest.raises(cfp.CheckpointError, match=r"results\.json: cannot be read"):
         _ = run.results
+
+
+def test_an_algorithm_of_baselines_is_pointed_to(monkeypatch):
+    monkeypatch.setattr(registry, "OTHER_NAMES", {})  # as long as baselines is not imported
+    monkeypatch.setattr(registry, "ALGORITHMS", {"cfp-sac": registry.ALGORITHMS["cfp-sac"]})
+    with pytest.raises(cfp.ConfigError, match=r"one of cfp-sac, got 'shac'; baselines\.fit and baselines\.Run"):
+        cfp.fit("run", algo="shac")
 
 
 @pytest.mark.parametrize(

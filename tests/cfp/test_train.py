@@ -289,3 +289,5 @@ def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
     )
     again = parse(["--config", str(folder / "config.json")]).run  # as the page says
     assert json.loads(json.dumps(to_json(again))) == json.loads((folder / "config.json").read_text())
+    assert resume(folder, "--steps", "60", "--no-video") == 0  # the film shows the policy of 40 steps
+    assert "video.mp4" not in (folder / "index.html").read_text() and not (folder / "replay.html").exists()

@@ -143,6 +143,19 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
             dittogym.make_spec(task)
 
 
+def test_a_task_of_a_module_is_not_another_one_of_its_name(tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    for module, horizon in (("first_hill", 5), ("second_hill", 6)):
+        (tmp_path / f"{module}.py").write_text(
+            "import dataclasses, dittogym\n"
+            f"def hill(): return dataclasses.replace(dittogym.make_spec('run'), name='hill', horizon={horizon})\n"
+            "dittogym.register('hill', hill)"
+        )
+        assert dittogym.make_spec(f"{module}:hill").horizon == horizon
+    with pytest.raises(ValueError, match="module 'second_hill' has registered another 'hill' since"):
+        dittogym.make_spec("first_hill:hill")
+
+
 def test_names_and_files_of_tasks() -> None:
     dittogym.register("hop", hop)
     assert headline("hop") == headline("module:hop") == ("hop", "")
