@@ -31,7 +31,7 @@ from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder
 from cfp.files import read_json, write_json
 from cfp.hub import is_address
-from cfp.policy import Policy, check_trained_for, policy_file, shipped
+from cfp.policy import Policy, check_names, check_trained_for, policy_file, shipped
 from cfp.registry import algo_of
 from cfp.tables import Table, columns
 from dittogym import make_spec
@@ -201,10 +201,7 @@ def run(command: Command) -> None:
     results = {path.resolve(): read_results(path) for path in paths}  # a policy counts once
     names = [name for name in command.policies if not name.endswith(".json")]
     found = [candidate for name in names for candidate in candidates(name, command.tasks)]
-    hashes: dict[tuple[str, str], str | None] = {}
-    for row, _ in found:  # one file of results would replace the other
-        if hashes.setdefault((row["task"], row["policy"]), row["sha256"]) != row["sha256"]:
-            raise ConfigError(f"policies must have names of their own, got two called {row['policy']!r}")
+    check_names((row["task"], row["policy"], row["sha256"]) for row, _ in found)
     for row, policy in found:
         command.out.mkdir(parents=True, exist_ok=True)
         returns, successes = episodes(row["task"], policy)

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -378,6 +378,18 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     if (found := trained_layout(policy)) != (expected := config.action_layout):
         raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
+
+
+def check_names(policies: Iterable[tuple[str, str, str | None]]) -> None:
+    """Refuse different policies of one name, whose results would replace each other.
+
+    Args:
+        policies: Task, name, and hash of the file of each; None for a policy without a file.
+    """
+    files: dict[tuple[str, str], str | None] = {}
+    for task, name, sha256 in policies:
+        if files.setdefault((task, name), sha256) != sha256:
+            raise ConfigError(f"policies must have names of their own, got two called {name!r} on {task}")
 
 
 def check_trained_for(option: str, description: Mapping[str, Any], task: str, environment: EnvironmentConfig) -> None:

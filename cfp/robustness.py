@@ -20,7 +20,7 @@ from cfp.evaluation.returns import Result, UntrainedPolicy, decision_grid, evalu
 from cfp.experiment.cli import read_command, run_command
 from cfp.files import check_output, write_text
 from cfp.hub import is_address
-from cfp.policy import Policy, check_trained_for, policy_file
+from cfp.policy import Policy, check_names, check_trained_for, policy_file
 from cfp.tables import Table, columns, csv_text
 from dittogym import Conditions
 from dittogym.spec import DT, TaskSpec
@@ -193,15 +193,6 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     return sorted((each for each in found if each.episodes), key=lambda each: each.particles == "full")
 
 
-def check_names(evaluations: Sequence[Evaluation]) -> None:
-    """Refuse different policies of one name, whose rows would replace each other."""
-    files: dict[tuple[str, str], str] = {}
-    for each in evaluations:
-        name = each.head["task"], each.name
-        if files.setdefault(name, each.sha256) != each.sha256:
-            raise ConfigError(f"policies must have names of their own, got two called {each.name!r} on {name[0]}")
-
-
 # Rows.
 
 
@@ -257,7 +248,7 @@ def run(command: Command) -> None:
     plans = [plan(command, given) for given in command.policies]
     for evaluations in plans:
         check_task(evaluations[0].config.task)  # the module of a later policy may have replaced it
-    check_names([each for evaluations in plans for each in evaluations])
+    check_names((each.head["task"], each.name, each.sha256) for evaluations in plans for each in evaluations)
     rows = read_rows(command.rows)
     for evaluations in plans:
         heads = [each.head for each in evaluations]

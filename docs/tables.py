@@ -86,7 +86,7 @@ def estimate(row: Row) -> str:
     return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
 
 
-#: Tasks whose policy was preferred to another one by these very episodes from its own start, which flatters them.
+#: Tasks whose policy was preferred to another one by five of its episodes from its own start, which flatters them.
 CHOSEN_ON_OWN_START = ("dig", "obstacle")
 
 

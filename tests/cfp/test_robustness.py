@@ -179,14 +179,14 @@ def test_policies_of_two_tasks_of_one_name_are_refused(tmp_path, monkeypatch, ca
     monkeypatch.syspath_prepend(tmp_path)
     files = [tmp_path / f"{module}.safetensors" for module in ("first_slope", "second_slope")]
     config = sac_preset("run")
-    for file in files:
-        file.with_suffix(".py").write_text(
-            "import dataclasses, dittogym\n"
-            "def slope(): return dataclasses.replace(dittogym.make_spec('run'), name='slope')\n"
-            "dittogym.register('slope', slope)"
-        )
-        save_actor(file, build_actor(config.actor_spec(1)), replace(config, task=f"{file.stem}:slope"), 1, 0)
-    with mock.patch.dict(TASKS), mock.patch.dict(gymnasium.registry):
+    with mock.patch.dict(TASKS), mock.patch.dict(gymnasium.registry):  # saving a policy imports its task, too
+        for file in files:
+            file.with_suffix(".py").write_text(
+                "import dataclasses, dittogym\n"
+                "def slope(): return dataclasses.replace(dittogym.make_spec('run'), name='slope')\n"
+                "dittogym.register('slope', slope)"
+            )
+            save_actor(file, build_actor(config.actor_spec(1)), replace(config, task=f"{file.stem}:slope"), 1, 0)
         assert robustness.main([*map(str, files), "--device", "cpu"]) == 2
     assert "module 'second_slope' has registered another 'slope' since" in capsys.readouterr().err
 

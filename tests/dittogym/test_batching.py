@@ -141,7 +141,8 @@ def test_a_failed_element_of_a_vector_environment_starts_anew() -> None:
     env.state.v[1] = torch.nan
     _, rewards, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert terminated.tolist() == [False, True, False] and rewards[1] == FAILURE_REWARD
-    assert not info["final_info"]["finite"][1] and info["finite"].all()
+    assert info["final_info"]["_finite"].tolist() == [False, True, False]
+    assert not info["final_info"]["finite"].any() and info["finite"].all()
     _, _, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert info["finite"].all() and not terminated.any()
 
