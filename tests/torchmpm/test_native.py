@@ -217,8 +217,8 @@ state = torchmpm.ParticleState.at_rest(0.4 + 0.2 * torch.rand(4, 500, 2))
 solver.step(state)
 signal.signal(signal.SIGALRM, signal.default_int_handler)
 for enabled in (True, False):
-    signal.setitimer(signal.ITIMER_REAL, 0.1)
     try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
         with torch.set_grad_enabled(enabled):
             solver.step(state, substeps=10**12)
     except KeyboardInterrupt:
