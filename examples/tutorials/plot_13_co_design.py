@@ -12,9 +12,9 @@ and the stiffness of the body.
 # ----------------------
 #
 # The particles of the disc are moved to new places by a map that keeps areas, and with them masses: the body becomes
-# longer where it becomes lower. With $u$ from 0 at the rear end to 1 at the front, lengths are multiplied by $g(u)$,
-# heights above the floor by $1/g(u)$. Stiffness is multiplied by the exponential of a bounded linear function of
-# $u$ and height.
+# longer where it becomes lower. With :math:`u` from 0 at the rear end to 1 at the front, lengths are multiplied by
+# :math:`g(u)`, and heights above the floor by :math:`1/g(u)`. Stiffness is multiplied by the exponential of a bounded
+# linear function of :math:`u` and the height.
 
 import dataclasses
 import math
