@@ -305,9 +305,9 @@ def splat_means(shown: RasterInput) -> Tensor:
     free = 1.0 if background is None else 1.0 - background.fraction
     hit = -torch.expm1(-expected_moving / SATURATION)
     some = expected_moving > 0
-    per_particle = torch.where(some, hit / torch.where(some, expected_moving, 1.0), 0.0)
+    share = torch.where(some, hit / torch.where(some, expected_moving, 1.0), 0.0)  # of one expected particle
     occupancy = 1.0 - free * torch.exp(-expected / SATURATION)
-    return torch.stack((occupancy, sums[1] * per_particle, sums[2] * per_particle), dim=1)
+    return torch.stack((occupancy, sums[1] * share, sums[2] * share), dim=1)
 
 
 def _splat_weights(shown: RasterInput) -> tuple[Tensor, Tensor]:

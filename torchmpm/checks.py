@@ -95,9 +95,10 @@ def points(name: str, given: Any) -> None:
 
 def pair(name: str, given: Any, *, above: float | None = None) -> None:
     """Raise a ValueError unless these are two finite numbers, x and y, above ``above``."""
-    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or len(given) != 2:
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if not isinstance(listed, Sequence) or isinstance(listed, str) or len(listed) != 2:
         raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
-    for axis, each in zip("xy", given, strict=True):
+    for axis, each in zip("xy", listed, strict=True):
         number(f"{name} {axis}", each, above=above)
 
 

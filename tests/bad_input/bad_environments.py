@@ -229,6 +229,7 @@ VALUES = [
     ("body", lambda: body(42)),
     ("body", lambda: body(np.zeros((5, 5, 2), np.uint8))),
     ("kind of a body", lambda: json_of(Tilted((0.1, 0.16), 0.15))),
+    ("kind of a body", lambda: body({"kind": ["Disc"]})),
     ("robot", lambda: body(Rectangle((-0.45, 0.2), (0.1, 0.9)))),  # outside the window
     ("robot", lambda: body(Rectangle((0.25, 0.16), (0.1, 0.1)), "kick")),  # in the object
     ("robot", lambda: body(Rectangle((0.05, 0.1), (0.1, 0.1)))),  # in the floor
@@ -236,6 +237,7 @@ VALUES = [
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Disc((0.17, 0.02), 0.06), 100),)))),
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)))),
     *(("target", lambda t=t: target(t)) for t in ("heart", 3, np.zeros((64, 64), bool), np.full((8, 8), 2.0))),
+    ("target", lambda: target([[1], [1, 0]])),
     ("corner", lambda: Disc("home", 0.1)),
     ("draws", lambda: Rectangle((0, 0), (1, 1), draws=0)),
     ("mask", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1)),
@@ -290,6 +292,7 @@ TYPES = [
     ("env_state", lambda: setattr(begun(), "env_state", None)),
     ("env", lambda: action_resolution(env(), 4)),
     ("env", lambda: trajectories.record(None, lambda seen: None)),
+    *(("fields", lambda f=f: trajectories.record(env(), lambda seen: None, fields=f)) for f in ("xv", (1,))),
     ("policy", lambda: as_function(3, "image")),
     ("make", lambda: register(5)),
     ("make", lambda: register(lambda: None)),

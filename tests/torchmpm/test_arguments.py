@@ -123,7 +123,7 @@ VALUES = {
     "poisson": [lambda p=p: lame(1.0, p) for p in (0.5, torch.tensor([0.2, 0.7]))],
     "bodies": [lambda: solver(bodies=())],
     "gravity": [
-        *(lambda g=g: solver(gravity=g) for g in (-9.8, (0.0, -1e30), torch.tensor([1e30, 0.0]))),
+        *(lambda g=g: solver(gravity=g) for g in (-9.8, np.array(-9.8), (0.0, -1e30), torch.tensor([1e30, 0.0]))),
         *(lambda g=g: solver(gravity=torch.zeros(g)) for g in ((), (3,), (5, 5), (1, 1, 2), 0, (0, 2))),
         *(lambda g=g: solver(gravity=g) for g in (torch.zeros(2) * 1j, torch.zeros(2) == 1, torch.tensor([0.0, NAN]))),
         lambda: solver(gravity=torch.zeros(3, 2)).step(lively(5, 2)),
