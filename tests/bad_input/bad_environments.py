@@ -11,7 +11,7 @@ from bad_cases import table
 import dittogym
 from dittogym import Reward, TorchEnv, core, make_spec, trajectories
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
-from dittogym.geometry import Box, Obstacle, Window, floor, solid
+from dittogym.geometry import Box, Obstacle, Window, floor, side_walls, solid
 from dittogym.render.recording import as_function
 from dittogym.rewards import EXACT, SMOOTH, distance
 from dittogym.spec import BodySpec
@@ -248,6 +248,7 @@ VALUES = [
     ("boxes", lambda: solid("thin", (3, 5), (0, 9))),
     ("boxes", lambda: Obstacle("nothing")),
     ("friction", lambda: floor(friction=-1.0)),
+    *(("top", lambda top=top: side_walls(top)) for top in (2.5, "high")),
     ("friction", lambda: replace(floor(), friction=0.3)),  # it would have no effect
     ("left", lambda: Window(left=0.1, follow=0.4)),
     # Tasks.
