@@ -23,7 +23,7 @@ from torchmpm import checks
 
 
 class AutoresetStep(NamedTuple):
-    """A step of a batch with a leading B throughout; all but the observation on the host."""
+    """A step of a batch with a leading B throughout; all but the observation and ``reset_info`` on the host."""
 
     observation: Tensor  # Of new episodes where done
     reward: np.ndarray  # (B,)

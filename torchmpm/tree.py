@@ -72,7 +72,7 @@ def leaves(tree: Any) -> list[Tensor]:
 
 
 def is_open(tree: Any) -> bool:
-    """Whether all leaves of a tree are tensors, numbers, texts or None, so that none hides tensors of its own."""
+    """Whether all leaves of a tree are tensors, numbers, strings or None, so that none hides tensors of its own."""
     return _closed(tree) is None
 
 
@@ -86,7 +86,7 @@ def check_open(name: str, tree: Any) -> None:
     closed = _closed(tree)
     if closed is not None:
         raise TypeError(
-            f"{name} must hold tensors, numbers, texts and containers of them alone, got a {type(closed).__name__}: "
+            f"{name} must hold only tensors, numbers, strings and containers of them, got a {type(closed).__name__}: "
             "register a dataclass with torchmpm.tree.register, and give the tensors of other objects"
         )
 

@@ -98,6 +98,9 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
 
     Args:
         variant: ``"registered"``, or ``"published"`` for the material of the published training run.
+
+    Raises:
+        ValueError: There is no such variant.
     """
     if variant not in tuple(VARIANTS):
         raise ValueError(f"variant must be one of {tuple(VARIANTS)}, got {variant!r}")
