@@ -88,6 +88,10 @@ def film(path=None, policy=lambda seen: None, **options):
     return env().film(policy, path, **options)
 
 
+def played():
+    return env().film(lambda seen: np.zeros((1, 2, 8, 8), np.float32), max_steps=1)
+
+
 def body(given, task="run"):
     return env(task=task, body=given)
 
@@ -207,6 +211,9 @@ VALUES = [
     ("physics", lambda: pure_reset(torch.full((1, 60, 2), 0.3), young=torch.ones(1))),
     ("zoom", lambda: begun().render(zoom=1e-9)),
     ("size", lambda: begun().render(size=3)),
+    ("muscles", lambda: begun().render(muscles="no")),
+    ("time", lambda: played().picture(NAN)),
+    *(("speed", lambda s=s: played().page(s)) for s in (0, -1.0)),
     ("policy", film),
     ("policy", lambda: film(policy=OfTheGrid())),
     ("path", lambda: film("film.avi")),
