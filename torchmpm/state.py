@@ -165,7 +165,7 @@ class ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
 
         Raises:
-            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes.
+            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes or another dtype.
             TypeError: ``mask`` is not a tensor.
         """
         return tree.where(mask, self, other)

@@ -141,10 +141,10 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
     Args:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
-        other: A tree of the same structure and shapes.
+        other: A tree of the same structure, shapes and dtypes.
 
     Raises:
-        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure or shapes.
+        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure, shapes or dtypes.
         TypeError: ``mask`` is not a tensor.
     """
     if not isinstance(mask, Tensor):
@@ -154,9 +154,9 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         if mask.dtype != torch.bool or mask.shape != chosen.shape[:1]:
             expected = f"bool of shape {tuple(chosen.shape[:1])}"
             raise ValueError(f"mask must be {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
-        if otherwise.shape != chosen.shape:
-            shapes = f"{tuple(chosen.shape)} and {tuple(otherwise.shape)}"
-            raise ValueError(f"other must be of the same shapes, got a tensor of shapes {shapes}")
+        if otherwise.shape != chosen.shape or otherwise.dtype != chosen.dtype:
+            allowed, found = (f"{each.dtype} of shape {tuple(each.shape)}" for each in (chosen, otherwise))
+            raise ValueError(f"other must have the same shapes and dtypes, got {found} in place of {allowed}")
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)

@@ -147,7 +147,10 @@ VALUES = {
         *(lambda a=a: robot(5).stable_dt(a) for a in (NAN, "strong", torch.tensor([1.0, INF]))),
     ],
     "stiffness() of bodies[0].material": [lambda: solver(bodies=(body(material=Endless(300.0, 80.0)),))],
-    "other": [lambda s=s: lively(5).where(torch.tensor([True]), s) for s in (lively(5, 3), lively(4))],
+    "other": [
+        lambda s=s: lively(5).where(torch.tensor([True]), s)
+        for s in (lively(5, 3), lively(4), lively(5).to(torch.float32))
+    ],
     "origin": [lambda: step(origin=torch.zeros(2).double())],
     "x": [
         *(lambda s=s: state(x=torch.zeros(s)) for s in ((5, 3), (5,), (2, 5, 1), (1, 2, 5, 2))),
