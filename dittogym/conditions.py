@@ -35,7 +35,7 @@ _CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
 _FACTORS = ("mu", "yield_stress", "gravity")
 #: What an episode draws, in the order of its random numbers.
 _NAMES = ("latency", "action_noise", "action_dropout", "observation_dropout", *_FACTORS, "shift", "turn", "velocity")
-#: Fields that are no ranges.
+#: Fields that are not ranges.
 _SINGLE = ("shift", "turn", "velocity", "chance")
 
 

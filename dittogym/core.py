@@ -1,4 +1,4 @@
-"""An environment as pure functions: :func:`reset` and :func:`step` of a :class:`Model` and a :class:`EnvState`."""
+"""An environment as pure functions: :func:`reset` and :func:`step` of a :class:`Model` and an :class:`EnvState`."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ class StepResult(NamedTuple):
         terminated: (B,) bool.
         success: (B,) bool; ``None`` where the task does not define it.
         info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own; leading B.
-        true_reward: (B,) the task's reward; ``reward`` unless that is smooth.
+        true_reward: (B,) the task's reward; equal to ``reward`` unless that is smooth.
         actuation: (B, 2, P, P) on the patch, Pa.
         soft_observation: (B, 3, 64, 64) of :func:`soft_observation`; ``None`` unless the reward is smooth.
     """

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.native.cuda.driver import Driver, Launch
+from torchmpm.native.tables import members
 
 _SOURCE = Path(__file__).with_name("picture.cu")
 #: Threads of a block, the blocks that share an image, and the fine pixels of each.
@@ -26,11 +27,11 @@ class Arguments(ctypes.Structure):
     """The only argument of the kernel, as ``struct Arguments`` in ``picture.cu``."""
 
     _fields_ = [
-        *((name, ctypes.c_int64) for name in ("batch", "particles", "pixels", "bodies", "boxes")),
-        *((name, ctypes.c_void_p) for name in ("body", "box")),
+        *members(ctypes.c_int64, "batch", "particles", "pixels", "bodies", "boxes"),
+        *members(ctypes.c_void_p, "body", "box"),
         ("view", ctypes.c_double * 2),
-        *((name, ctypes.c_double) for name in ("margin", "extent", "clip", "saturation", "unit", "speed_unit")),
-        *((name, ctypes.c_void_p) for name in ("x", "v", "origin", "centre", "image")),
+        *members(ctypes.c_double, "margin", "extent", "clip", "saturation", "unit", "speed_unit"),
+        *members(ctypes.c_void_p, "x", "v", "origin", "centre", "image"),
     ]
 
 

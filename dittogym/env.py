@@ -66,7 +66,7 @@ def as_numpy(value: torch.Tensor | dict[str, Any]) -> Any:
 def first(value: Any) -> Any:
     """The first element of an array, or of all in an ``info``; numbers come out as NumPy scalars.
 
-    Truth values are Python's own, as Gymnasium's wrappers take NumPy's for objects that they do not know.
+    Bools are Python's, because Gymnasium's wrappers do not recognise those of NumPy.
     """
     if isinstance(value, dict):
         return {name: first(entry) for name, entry in value.items()}
@@ -182,7 +182,7 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
 
         Returns:
             Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays, NumPy scalars and
-            truth values of Python; the reward terms have keys such as ``"reward_terms/velocity"``.
+            Python's bools; the reward terms have keys such as ``"reward_terms/velocity"``.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)

@@ -177,19 +177,41 @@ def floor(*, friction: float = inf) -> Obstacle:
     """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts).
 
     For ground of another height use :func:`solid`.
+
+    Args:
+        friction: Coulomb coefficient; ``math.inf`` sticks.
+
+    Raises:
+        ValueError: ``friction`` is negative or not a number.
     """
     rule = VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction)
     return Obstacle("floor", (nodes(top=FLOOR_NODE + 1),), rules=(rule,), observed=())
 
 
 def ceiling(node: int) -> Obstacle:
-    """Upper end of the world: from this node on, nothing rises."""
+    """Upper end of the world: from this node on, nothing rises.
+
+    Args:
+        node: Index of the node, counted upwards from the world's origin.
+
+    Raises:
+        ValueError: ``node`` is not a whole number from 0 on.
+    """
     checks.whole("node", node, 0)
     return Obstacle("ceiling", (nodes(bottom=node),), rules=(VelocityRule("+y", j=(node, None)),), observed=())
 
 
 def side_walls(top: int | None) -> Obstacle:
-    """Invisible walls at x = -0.25 m and x = 0.25 m, as GROW, DIG and CATCH have them, up to this node."""
+    """Invisible walls at x = -0.25 m and x = 0.25 m, as GROW, DIG and CATCH have them.
+
+    Args:
+        top: Their last node, counted upwards from the world's origin; ``None``: they have no end.
+
+    Raises:
+        ValueError: ``top`` is not a whole number from 0 on.
+    """
+    if top is not None:
+        checks.whole("top", top, 0)
     height = inf if top is None else top
     boxes = (nodes(32, 34, top=height), nodes(-34, -32, top=height))
     rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))

@@ -24,6 +24,7 @@ from torchmpm.native.cuda.compiler import unavailable
 from torchmpm.native.cuda.driver import Driver
 from torchmpm.native.cuda.launcher import CUDA
 from torchmpm.native.library import POOL, build, thread_pool
+from torchmpm.native.tables import members
 from torchmpm.sampling import sobol
 from torchmpm.transfer import quadratic_weights
 from torchmpm.tree import cached_tensors, transforming
@@ -304,9 +305,9 @@ def splat_means(shown: RasterInput) -> Tensor:
     free = 1.0 if background is None else 1.0 - background.fraction
     hit = -torch.expm1(-expected_moving / SATURATION)
     some = expected_moving > 0
-    per_particle = torch.where(some, hit / torch.where(some, expected_moving, 1.0), 0.0)
+    share = torch.where(some, hit / torch.where(some, expected_moving, 1.0), 0.0)  # of one expected particle
     occupancy = 1.0 - free * torch.exp(-expected / SATURATION)
-    return torch.stack((occupancy, sums[1] * per_particle, sums[2] * per_particle), dim=1)
+    return torch.stack((occupancy, sums[1] * share, sums[2] * share), dim=1)
 
 
 def _splat_weights(shown: RasterInput) -> tuple[Tensor, Tensor]:
@@ -333,13 +334,13 @@ class Picture(ctypes.Structure):
     """The arguments of one call, as ``struct Picture`` in ``picture.cpp``."""
 
     _fields_ = [
-        *((name, ctypes.c_int64) for name in ("batch", "particles", "threads", "pixels")),
-        *((name, ctypes.c_void_p) for name in POOL),
-        *((name, ctypes.c_int64) for name in ("bodies", "boxes")),
-        *((name, ctypes.c_void_p) for name in ("body", "box")),
+        *members(ctypes.c_int64, "batch", "particles", "threads", "pixels"),
+        *members(ctypes.c_void_p, *POOL),
+        *members(ctypes.c_int64, "bodies", "boxes"),
+        *members(ctypes.c_void_p, "body", "box"),
         ("view", ctypes.c_double * 2),
-        *((name, ctypes.c_double) for name in ("margin", "extent", "clip", "saturation")),
-        *((name, ctypes.c_void_p) for name in ("x", "v", "origin", "centre", "image")),
+        *members(ctypes.c_double, "margin", "extent", "clip", "saturation"),
+        *members(ctypes.c_void_p, "x", "v", "origin", "centre", "image"),
     ]
 
 

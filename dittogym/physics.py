@@ -40,8 +40,7 @@ def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
 def default(spec: TaskSpec, name: str, like: Tensor) -> Tensor:
     """The task's own value of one of :data:`NAMES`, as :func:`defaults` gives it."""
     value = getattr(spec, name, 1.0)  # a factor of 1 on the mass
-    own = value.to(like) if isinstance(value, Tensor) else constant(value, like)
-    return _expanded(own, name, len(like))
+    return _expanded(constant(value, like), name, len(like))
 
 
 def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor]:

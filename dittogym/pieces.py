@@ -16,7 +16,7 @@ def largest_piece(x: Tensor, origin: Tensor) -> np.ndarray:
     """Share of the particles, (B,) from 0 to 1, that the largest connected piece of each robot holds.
 
     A piece consists of cells of the grid, 1/128 m wide, that hold particles. Of these only blocks of 2 x 2 count, so
-    that a strand one cell wide connects nothing and belongs to no piece; cells that touch, be it at a corner, are
+    that a strand one cell wide connects nothing and belongs to no piece; cells that touch, even at a corner, are
     connected. With fewer than about 2,000 particles robots have holes, and the share means little.
 
     Args:

@@ -185,6 +185,9 @@ class RewardOps:
 
         Returns:
             (B, K).
+
+        Raises:
+            ValueError: ``fraction`` is out of range.
         """
         if not 0 < fraction <= 1:
             raise ValueError(f"fraction must be above 0 and at most 1, got {fraction!r}")

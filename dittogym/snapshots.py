@@ -39,7 +39,7 @@ torch.serialization.add_safe_globals([Snapshot, EnvState, Features])  # tensors,
 
 
 def constants_of(model: Model, like: Tensor) -> dict[str, str]:
-    """By name what determines an episode besides its state, as texts that are equal for equal values.
+    """What determines an episode besides its state, by name, as strings that are equal for equal values.
 
     Tensors that require gradients are identified by their shape alone, because training changes their values.
 

@@ -85,7 +85,7 @@ class TaskSpec:
         split_limit: The robot's radius of gyration at which it counts as torn and the episode ends, m; ``None``: it
             never does.
         initial_task_state: What to remember from the start of an episode, tensors with a leading B.
-        target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
+        target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; renderings of the task show it.
 
     Raises:
         ValueError: A number is out of range, or there is more than one object.

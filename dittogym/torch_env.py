@@ -128,7 +128,7 @@ class TorchEnv:
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         trial = InitialPositions(self.spec, counts, 2, random=False, resample=False)
         core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
-        self.device = self._like.device  # with the number of what is the current device now
+        self.device = self._like.device  # "cuda" with the number of the current device
         self._physics: Physics = {}
         self.conditions = as_conditions(conditions)
         if self.conditions is not None:
@@ -315,7 +315,7 @@ class TorchEnv:
             now = features_of(old.particles, self.model.num_robot_particles)
             kept = replace(old, physics={}), self.observation(), core.info_of(self.model, old, now)
             others = replace(fresh, physics={}), observation, info
-            fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
+            fresh, observation, info = tree.map(lambda every, some: every.index_copy(0, index, some), kept, others)
             fresh = replace(fresh, physics=merged(self.spec, old.physics, all_physics, where, self._like))
             actuation = self._actuation_without(where)
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.

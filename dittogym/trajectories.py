@@ -67,7 +67,7 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
 
     Raises:
-        TypeError: The environment or the policy is of another kind.
+        TypeError: The environment, the policy or ``fields`` is of another kind.
         ValueError: The environment has more than one simulation, or there is no such field.
     """
     seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
@@ -77,6 +77,7 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
         raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
     if torch_env.num_envs != 1:
         raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
+    checks.instances("fields", fields, str)
     if unknown := [name for name in fields if name not in FIELDS]:
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
     act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env.action_layout)

@@ -18,12 +18,12 @@ from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, flat, spaces
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
-from dittogym.torch_env import TorchEnv
+from dittogym.torch_env import TorchEnv, find_mask
 from torchmpm import checks
 
 
 class AutoresetStep(NamedTuple):
-    """A step of a batch with a leading B throughout; all but the observation on the host."""
+    """A step of a batch with a leading B throughout; all but the observation and ``reset_info`` on the host."""
 
     observation: Tensor  # Of new episodes where done
     reward: np.ndarray  # (B,)
@@ -132,8 +132,7 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation, info = self.torch_env.reset(seed=seed, options=options)
         first_seed = seed[0] if isinstance(seed, Sequence | np.ndarray) else seed
         super().reset(seed=None if first_seed is None else int(first_seed))
-        mask = (options or {}).get("reset_mask")
-        self._ended &= False if mask is None else ~_array(mask)
+        self._ended &= ~find_mask("reset_mask", (options or {}).get("reset_mask"), self.num_envs)
         return as_numpy(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
 
     @torch.no_grad()
@@ -171,8 +170,8 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         quantities = dict(zip(names, (*own, self.torch_env.env_state.steps), strict=True))
         info = to_host(flat(raw) | quantities)  # in one piece: a GPU is waited for once
         reward, terminated, steps = (info.pop(name) for name in names)
-        rewards, ends, limits = reward.astype(np.float64) * ~fresh, terminated & ~fresh, steps >= self._horizon
-        limits &= ~fresh
+        rewards = np.where(fresh, 0.0, reward.astype(np.float64))
+        ends, limits = terminated & ~fresh, (steps >= self._horizon) & ~fresh
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = ends | limits
         start: dict[str, Tensor] = {}
@@ -191,7 +190,7 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             The observations (B, 3, 64, 64) uint8 of all elements.
         """
         observation = self.torch_env.load(snapshot, mask)
-        self._ended &= False if mask is None else ~_array(mask)
+        self._ended &= ~find_mask("mask", mask, self.num_envs)
         return as_numpy(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -200,10 +199,6 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _repr_png_(self) -> bytes | None:
         return self.torch_env._repr_png_()
-
-
-def _array(values: Any) -> np.ndarray:
-    return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
 
 
 def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

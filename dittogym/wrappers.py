@@ -21,6 +21,14 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     """Actions of (2, size, size), enlarged to the resolution of ``env`` by bicubic interpolation.
 
     The option ``resolution=size`` of :func:`gymnasium.make` enlarges them in one step with the physics instead.
+
+    Args:
+        env: A single or a vector environment of Gymnasium.
+        size: Rows and columns of the new actions, at most those of the actions of ``env``.
+
+    Raises:
+        ValueError: ``size`` is not a whole number in this range.
+        TypeError: ``env`` is not a Gymnasium environment with a ``Box`` of actions.
     """
     box = _box(env, "action_space")
     size = checks.whole("size", size, 1, box.shape[-1])
@@ -33,7 +41,16 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
 
 
 def observation_resolution(env: AnyEnv, size: int) -> Any:
-    """Observations of (..., 3, size, size), reduced by averaging over areas."""
+    """Observations of (..., 3, size, size), reduced by averaging over areas.
+
+    Args:
+        env: A single or a vector environment of Gymnasium.
+        size: Rows and columns of the new observations, at most those of the observations of ``env``.
+
+    Raises:
+        ValueError: ``size`` is not a whole number in this range.
+        TypeError: ``env`` is not a Gymnasium environment with a ``Box`` of observations.
+    """
     box = _box(env, "observation_space")
     size = checks.whole("size", size, 1, box.shape[-1])
     small = _resized_space(box, size)

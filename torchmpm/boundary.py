@@ -55,15 +55,20 @@ class VelocityRule:
             raise ValueError(f"frame must be 'world' or 'window', got {self.frame!r}")
         if self.friction != math.inf:
             checks.number("friction", self.friction, least=0.0)
-        for name, given in (("i", self.i), ("j", self.j)):
-            pair = isinstance(given, tuple | list) and len(given) == 2
-            ends: list[Any] = [end for end in given if end is not None] if pair else [None]
-            if not all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends) or ends != sorted(ends):
-                raise ValueError(
-                    f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, "
-                    f"got {given!r}"
-                )
-            object.__setattr__(self, name, tuple(None if end is None else int(end) for end in given))
+        for name in ("i", "j"):
+            object.__setattr__(self, name, _checked_range(name, getattr(self, name)))
+
+
+def _checked_range(name: str, given: Any) -> Range:
+    """A range of Python integers, or else a ValueError."""
+    if isinstance(given, tuple | list) and len(given) == 2:
+        ends = [end for end in given if end is not None]
+        if all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends) and ends == sorted(ends):
+            low, high = (None if end is None else int(end) for end in given)
+            return low, high
+    raise ValueError(
+        f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, got {given!r}"
+    )
 
 
 def fixed(

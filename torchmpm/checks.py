@@ -16,7 +16,7 @@ Segment: TypeAlias = int | Literal["auto"] | None
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """A whole number (no truth value) from ``least`` to ``most`` as a Python integer, or else a ValueError."""
+    """A whole number, not a bool, from ``least`` to ``most`` as a Python integer, or else a ValueError."""
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError(f"{name} must be a whole number, got {value!r}")
     number = int(value)
@@ -95,9 +95,10 @@ def points(name: str, given: Any) -> None:
 
 def pair(name: str, given: Any, *, above: float | None = None) -> None:
     """Raise a ValueError unless these are two finite numbers, x and y, above ``above``."""
-    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or len(given) != 2:
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if not isinstance(listed, Sequence) or isinstance(listed, str) or len(listed) != 2:
         raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
-    for axis, each in zip("xy", given, strict=True):
+    for axis, each in zip("xy", listed, strict=True):
         number(f"{name} {axis}", each, above=above)
 
 
@@ -116,7 +117,7 @@ def instances(name: str, given: Any, kind: type) -> None:
 
 
 def flag(name: str, given: Any) -> None:
-    """Raise a ValueError unless this is True or False; any text, "no" too, would count as true."""
+    """Raise a ValueError unless this is True or False; any string, even "no", would count as true."""
     if not isinstance(given, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {given!r}")
 

@@ -1,4 +1,8 @@
-"""Balances of a simulation: mass, momentum and energy."""
+"""Balances of a simulation: mass, momentum and energy.
+
+All functions raise a TypeError for anything but a solver and a state, and a ValueError for a state with another number
+of particles than the solver's bodies.
+"""
 
 import torch
 from torch import Tensor

@@ -25,8 +25,9 @@ class Grid:
     Attributes:
         resolution: Nodes per axis.
         spacing: Distance h between nodes in m; ``None`` means ``1 / resolution`` (a window of one metre).
-        margin: Particles closer than this to the left or right end of the window (m) take no part. Without a wall, half
-            a cell keeps out those of the left end that could be thrown around, as nodes can have negative mass there.
+        margin: Particles closer than this to the left or right end of the window (m) take no part. Where no wall keeps
+            them from the left end, half a cell is safer: there, weights can be negative, and with them the mass of a
+            node, which would throw particles around.
 
     Raises:
         ValueError: ``resolution`` is not a whole number from 4 to 32,768, ``spacing`` is not positive, or ``margin``

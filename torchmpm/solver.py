@@ -238,8 +238,8 @@ class Solver:
         return substep(scene, state)
 
     @property
-    def _replaced(self) -> str | None:
-        """The method with which a subclass computes something in another way, if it does."""
+    def _overridden(self) -> str | None:
+        """Which of the methods that the eager backend calls a subclass overrides, if any."""
         own = type(self)
         return next((n for n in ("substep", "scene") if getattr(own, n) is not getattr(Solver, n)), None)
 
@@ -273,12 +273,12 @@ class Solver:
     @property
     def _reads_scene_alone(self) -> bool:
         """Whether a substep reads no tensors but those of the scene; custom parts of it may read others."""
-        return not self._replaced and not torch.compiler.is_compiling() and tree.is_open((self.grid, self.bodies))
+        return not self._overridden and not torch.compiler.is_compiling() and tree.is_open((self.grid, self.bodies))
 
     def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
         """Why the kernels cannot run a step, or ``None`` if they can."""
-        if self._replaced:
-            return f"it does not call {type(self).__name__}.{self._replaced}"
+        if self._overridden:
+            return f"it does not call {type(self).__name__}.{self._overridden}"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
         if tree.has_tangents((*vars(state).values(), *fields, *self.constants.values())):
@@ -323,7 +323,7 @@ class Solver:
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
 
     def _try_laws(self, state: ParticleState) -> None:
-        """Before the first step, call each material of somebody else once, to see whether it returns what it must.
+        """Before the first step, call each custom material once, to see whether it returns what it must.
 
         With gradients before every step: what a law saves that differentiates its energy is counted by a checkpoint
         around the step, and has to be there again in the replay.

@@ -145,9 +145,10 @@ class ParticleState:
         """Select batch elements by a number, slice, list or tensor; a number keeps a batch dimension of one.
 
         Raises:
-            IndexError: There is no such batch element, or the index is of several dimensions, a tuple, True or False.
+            IndexError: There is no such batch element, or the index has several dimensions or is a tuple, string or
+                bool.
         """
-        if isinstance(index, tuple | bool):  # which would select particles, or count as 0 or 1
+        if isinstance(index, tuple | bool | str):  # a tuple would select particles, a bool count as 0 or 1
             raise IndexError(f"index must be a number, slice, list or tensor, got {index!r}")
         if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 and index.dtype not in (bool, torch.bool):
             index = index.item()
@@ -164,7 +165,7 @@ class ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
 
         Raises:
-            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes.
+            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes or another dtype.
             TypeError: ``mask`` is not a tensor.
         """
         return tree.where(mask, self, other)

@@ -72,7 +72,7 @@ def leaves(tree: Any) -> list[Tensor]:
 
 
 def is_open(tree: Any) -> bool:
-    """Whether all leaves of a tree are tensors, numbers, texts or None, so that none hides tensors of its own."""
+    """Whether all leaves of a tree are tensors, numbers, strings or None, so that none hides tensors of its own."""
     return _closed(tree) is None
 
 
@@ -86,7 +86,7 @@ def check_open(name: str, tree: Any) -> None:
     closed = _closed(tree)
     if closed is not None:
         raise TypeError(
-            f"{name} must hold tensors, numbers, texts and containers of them alone, got a {type(closed).__name__}: "
+            f"{name} must hold only tensors, numbers, strings and containers of them, got a {type(closed).__name__}: "
             "register a dataclass with torchmpm.tree.register, and give the tensors of other objects"
         )
 
@@ -141,10 +141,10 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
     Args:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
-        other: A tree of the same structure and shapes.
+        other: A tree of the same structure, shapes and dtypes.
 
     Raises:
-        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure or shapes.
+        ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure, shapes or dtypes.
         TypeError: ``mask`` is not a tensor.
     """
     if not isinstance(mask, Tensor):
@@ -154,9 +154,9 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         if mask.dtype != torch.bool or mask.shape != chosen.shape[:1]:
             expected = f"bool of shape {tuple(chosen.shape[:1])}"
             raise ValueError(f"mask must be {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
-        if otherwise.shape != chosen.shape:
-            shapes = f"{tuple(chosen.shape)} and {tuple(otherwise.shape)}"
-            raise ValueError(f"other must be of the same shapes, got a tensor of shapes {shapes}")
+        if otherwise.shape != chosen.shape or otherwise.dtype != chosen.dtype:
+            allowed, found = (f"{each.dtype} of shape {tuple(each.shape)}" for each in (chosen, otherwise))
+            raise ValueError(f"other must have the same shapes and dtypes, got {found} in place of {allowed}")
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)

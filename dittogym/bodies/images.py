@@ -59,6 +59,11 @@ def _separation(grey: np.ndarray) -> float:
 
 def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
     """A picture as uint8 (H, W), (H, W, 3) or (H, W, 4)."""
+    if isinstance(picture, list):  # an array that was JSON
+        try:
+            picture = np.asarray(picture)
+        except ValueError as error:
+            raise ValueError(f"{name} must be {others}an array or a path, got rows of different lengths") from error
     if isinstance(picture, np.ndarray):
         return _as_bytes(picture, name)
     if not isinstance(picture, (str, os.PathLike)):

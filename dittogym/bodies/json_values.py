@@ -59,9 +59,10 @@ def from_values(values: Any) -> Any:
         return tuple(from_values(each) for each in values)
     if not isinstance(values, Mapping):
         return values
-    if values.get("kind") not in KINDS:
+    kind = values.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(f"kind of a body or an obstacle must be one of {', '.join(KINDS)}, got {dict(values)!r}")
     made = {name: from_values(value) for name, value in values.items() if name != "kind"}
     if "mask" in made:
         made["mask"] = np.array(made["mask"], dtype=bool)
-    return KINDS[values["kind"]](**made)
+    return KINDS[kind](**made)

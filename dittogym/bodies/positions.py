@@ -118,23 +118,23 @@ class InitialPositions:
                 generators[i] = copy.deepcopy(generators[i])
             else:
                 redrawn[i] = given is not None
+        chosen = np.flatnonzero(redrawn)
         if given is not None:
             positions = self._given(given, like)
-        elif redrawn.any():
+            self._check_inside(positions, chosen)
+        elif len(chosen):
             stacked = np.zeros((self.num_envs, sum(self.counts), 2))
             bodies = tuple(zip(self.spec.bodies, self.counts, strict=True))
-            for i in np.flatnonzero(redrawn).tolist():
+            for i in chosen.tolist():
                 drawn = [body_positions(body, n, generators[i], random=self.random) for body, n in bodies]
                 stacked[i] = np.concatenate(drawn)
             host = torch.from_numpy(stacked).to(like.dtype)
-            self._check_inside(host, np.flatnonzero(redrawn))
+            self._check_inside(host, chosen)  # before it goes to a GPU, which would have to be waited for
             positions = to_device(host.numpy(), like.device)
         else:
             return self
         if len(self.positions):
             positions = tree.where(to_device(redrawn, like.device), positions, self.positions)
-        if given is not None:
-            self._check_inside(positions, np.arange(self.num_envs))
         return replace(self, generators=generators, positions=positions)
 
     def seeds(self, seed: Seed) -> Sequence[int | None]:

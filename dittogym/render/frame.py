@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from dittogym.geometry import NODES
 from dittogym.render.scene import RADIUS, SCALES, Scene, Shot, Solid, check_view
+from torchmpm import checks
 
 GROUND, SOLID, TARGET = (248, 246, 240), (112, 119, 130), (247, 198, 98)
 #: Lines, every second half metre of the background, every second tenth of the floor, outlines of bodies, text.
@@ -50,6 +51,7 @@ def frame(
         legend: Say below the caption what the colours mean.
     """
     width = check_view(size, zoom)
+    checks.flag("muscles", muscles)
     canvas = Canvas(size, shot.corner(width), width)
     marks = canvas.marks()
     canvas.target(scene.target, shot.centre)

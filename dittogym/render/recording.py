@@ -118,7 +118,11 @@ class Recording:
             muscles: Colour the robot by its muscles.
             caption: What to write into the upper corners.
             legend: Say below the caption what the colours mean.
+
+        Raises:
+            ValueError: ``time``, ``size`` or ``zoom`` is not a number in its range, or ``muscles`` not True or False.
         """
+        checks.number("time", time)
         at = float(np.clip(time / self.scene.dt, 0, len(self.shots) - 1))
         before, after = self.shots[int(at)], self.shots[min(int(at) + 1, len(self.shots) - 1)]
         if (part := np.float32(at - int(at))) > 1e-6:
@@ -157,8 +161,13 @@ class Recording:
         return path
 
     def page(self, speed: float | None = None) -> str:
-        """The replay as an HTML page, which begins to play at a ``speed``, see :class:`FilmOptions`."""
-        return replay_page(self.scene, self.shots, self.rewards, self.success, speed or self.default_speed)
+        """The replay as an HTML page, which begins to play at a ``speed``, see :class:`FilmOptions`.
+
+        Raises:
+            ValueError: ``speed`` is not positive.
+        """
+        speed = FilmOptions(speed=speed).speed or self.default_speed
+        return replay_page(self.scene, self.shots, self.rewards, self.success, speed)
 
     def _frames(self, options: FilmOptions, rate: float) -> Iterator[np.ndarray]:
         """The pictures of a film with task, time, return, playback speed and the meaning of colours."""

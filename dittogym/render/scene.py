@@ -189,7 +189,7 @@ def take(
 
     Of its values only ``quantities`` are computed: a picture shows muscles alone.
     """
-    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
+    if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
         raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
     index = int(index)
     one = slice(index, index + 1)

@@ -11,8 +11,6 @@ GOAL = (0.2, 0.17)
 #: Mean distance of the robot's particles (|x| + |y|) from the goal that counts as success (our definition), m.
 REACHED = 0.1
 SNOW = Snow(*lame(5000.0, 0.2))
-
-
 SOIL_PLACE = Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2)
 SOIL = BodySpec(SOIL_PLACE, count=8000, lite=3400, material=SNOW, hidden_velocity=True)
 

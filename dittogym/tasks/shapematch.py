@@ -19,7 +19,7 @@ def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     differing = (numbers - constant(spec.target, numbers)).abs().sum((1, 2))
     occupied = silhouette >= 0.5
     target = constant(spec.target, occupied)
-    iou = (occupied & target).sum((1, 2)).float() / (occupied | target).sum((1, 2))
+    iou = (occupied & target).sum((1, 2)).to(numbers) / (occupied | target).sum((1, 2))
     return Reward(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 
 

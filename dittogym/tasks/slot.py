@@ -77,12 +77,12 @@ def initial_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
 def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     """Approach to the cap, displacement of the cap, where it falls, and speed in both directions."""
     cap, front, ops = transition.object_com, front_distance(transition), transition.ops
-    z = 2.0 * (transition.task_state["front_distance"] - front)
+    approached = transition.task_state["front_distance"] - front
     fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
     side = 2.0 * ops.heaviside(cap[:, 0] - FAR_SIDE, FALL_WIDTH) - 1.0
     return Reward(
         terms={
-            "approach": ops.clamp(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0),
+            "approach": ops.clamp(signed_quadratic(4.0 * approached, 5.0), -20.0, 50.0),
             "object_location": 200.0 * (cap[:, 0] - CAP_START),
             "fall": 100.0 * side * ops.heaviside(FALLEN - cap[:, 1], FALL_WIDTH),
             "velocity": ops.clamp(signed_quadratic(transition.now.velocity, 10.0), -20.0, 20.0).sum(1),
@@ -98,6 +98,9 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
 
     Args:
         variant: ``"registered"``, or ``"published"`` for the material of the published training run.
+
+    Raises:
+        ValueError: There is no such variant.
     """
     if variant not in tuple(VARIANTS):
         raise ValueError(f"variant must be one of {tuple(VARIANTS)}, got {variant!r}")

@@ -60,8 +60,6 @@ def load_target(target: PictureLike, fit: bool = True) -> np.ndarray:
             unset.
     """
     checks.flag("fit", fit)
-    if isinstance(target, list):  # from JSON
-        target = np.asarray(target)
     if isinstance(target, str) and target in _OUTLINES:
         drawn: np.ndarray = np.zeros((SIZE, SIZE), np.uint8)
         for outline in _OUTLINES[target]:

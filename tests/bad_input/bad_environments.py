@@ -11,7 +11,7 @@ from bad_cases import table
 import dittogym
 from dittogym import Reward, TorchEnv, core, make_spec, trajectories
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
-from dittogym.geometry import Box, Obstacle, Window, floor, solid
+from dittogym.geometry import Box, Obstacle, Window, floor, side_walls, solid
 from dittogym.render.recording import as_function
 from dittogym.rewards import EXACT, SMOOTH, distance
 from dittogym.spec import BodySpec
@@ -86,6 +86,10 @@ def pure_reset(positions, **physics):
 
 def film(path=None, policy=lambda seen: None, **options):
     return env().film(policy, path, **options)
+
+
+def played():
+    return env().film(lambda seen: np.zeros((1, 2, 8, 8), np.float32), max_steps=1)
 
 
 def body(given, task="run"):
@@ -207,6 +211,9 @@ VALUES = [
     ("physics", lambda: pure_reset(torch.full((1, 60, 2), 0.3), young=torch.ones(1))),
     ("zoom", lambda: begun().render(zoom=1e-9)),
     ("size", lambda: begun().render(size=3)),
+    ("muscles", lambda: begun().render(muscles="no")),
+    ("time", lambda: played().picture(NAN)),
+    *(("speed", lambda s=s: played().page(s)) for s in (0, -1.0)),
     ("policy", film),
     ("policy", lambda: film(policy=OfTheGrid())),
     ("path", lambda: film("film.avi")),
@@ -229,6 +236,7 @@ VALUES = [
     ("body", lambda: body(42)),
     ("body", lambda: body(np.zeros((5, 5, 2), np.uint8))),
     ("kind of a body", lambda: json_of(Tilted((0.1, 0.16), 0.15))),
+    ("kind of a body", lambda: body({"kind": ["Disc"]})),
     ("robot", lambda: body(Rectangle((-0.45, 0.2), (0.1, 0.9)))),  # outside the window
     ("robot", lambda: body(Rectangle((0.25, 0.16), (0.1, 0.1)), "kick")),  # in the object
     ("robot", lambda: body(Rectangle((0.05, 0.1), (0.1, 0.1)))),  # in the floor
@@ -236,6 +244,7 @@ VALUES = [
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Disc((0.17, 0.02), 0.06), 100),)))),
     ("objects[0]", lambda: env(task=spec(objects=(BodySpec(Rectangle((0.9, 0.3), (0.2, 0.1)), 9),)))),
     *(("target", lambda t=t: target(t)) for t in ("heart", 3, np.zeros((64, 64), bool), np.full((8, 8), 2.0))),
+    ("target", lambda: target([[1], [1, 0]])),
     ("corner", lambda: Disc("home", 0.1)),
     ("draws", lambda: Rectangle((0, 0), (1, 1), draws=0)),
     ("mask", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1)),
@@ -246,6 +255,7 @@ VALUES = [
     ("boxes", lambda: solid("thin", (3, 5), (0, 9))),
     ("boxes", lambda: Obstacle("nothing")),
     ("friction", lambda: floor(friction=-1.0)),
+    *(("top", lambda top=top: side_walls(top)) for top in (2.5, "high")),
     ("friction", lambda: replace(floor(), friction=0.3)),  # it would have no effect
     ("left", lambda: Window(left=0.1, follow=0.4)),
     # Tasks.
@@ -290,6 +300,7 @@ TYPES = [
     ("env_state", lambda: setattr(begun(), "env_state", None)),
     ("env", lambda: action_resolution(env(), 4)),
     ("env", lambda: trajectories.record(None, lambda seen: None)),
+    *(("fields", lambda f=f: trajectories.record(env(), lambda seen: None, fields=f)) for f in ("xv", (1,))),
     ("policy", lambda: as_function(3, "image")),
     ("make", lambda: register(5)),
     ("make", lambda: register(lambda: None)),

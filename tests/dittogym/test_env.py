@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -95,6 +96,17 @@ def test_next_step_autoreset() -> None:
     assert np.array_equal(rows[4][0], rows[0][0]) and not rows[4][1].any() and not rows[4][3].any()
     assert not np.array_equal(rows[5][0], rows[0][0]) and rows[5][1].all()
     assert_reset(rows[4][4], start)
+
+
+def test_the_step_in_which_an_element_is_reset_has_no_reward() -> None:
+    def reward_fn(transition: dittogym.Transition, spec: dittogym.TaskSpec) -> dittogym.Reward:
+        return dittogym.Reward({"risen": transition.now.com[:, 1] / 0.0})
+
+    spec = replace(dittogym.make_spec("run"), reward_fn=reward_fn, weights={"risen": 1.0}, horizon=1)
+    envs = dittogym.BatchEnv(spec, 2, **SMALL)
+    envs.reset(seed=0)
+    action = np.zeros(envs.action_space.shape, np.float32)
+    assert [envs.step(action)[1].tolist() for _ in range(2)] == [[np.inf, np.inf], [0.0, 0.0]]
 
 
 def test_disabled_autoreset_with_a_mask() -> None:

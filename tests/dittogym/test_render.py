@@ -39,8 +39,9 @@ def test_muscles_target_and_size() -> None:
     env.step(torch.ones(2, *env.action_shape))
     red = near(env.render(1, muscles=True), CONTRACT)[0]
     assert len(red) > 1000
-    with pytest.raises(IndexError, match="index"):
-        env.render(2)
+    for index in (2, True):
+        with pytest.raises(IndexError, match="index"):
+            env.render(index)
 
 
 def test_a_shot_holds_the_quantities_that_are_asked_for() -> None:

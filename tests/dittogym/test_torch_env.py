@@ -122,6 +122,15 @@ def test_double_precision_as_default_changes_nothing(task: str, backend: str) ->
         assert one.dtype == other.dtype and torch.equal(one, other)
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_numbers_have_the_precision_of_the_environment(task: str) -> None:
+    env = small(task, particles=60, substeps=1)
+    _, info = env.reset(seed=0)
+    _, reward, *_, later = env.step(torch.zeros(1, *env.action_shape))
+    numbers = [value for value in tree.leaves((info, reward, later)) if value.is_floating_point()]
+    assert {value.dtype for value in numbers} == {torch.float64}
+
+
 @contextmanager
 def float64() -> Iterator[None]:
     torch.set_default_dtype(torch.float64)

@@ -123,7 +123,7 @@ VALUES = {
     "poisson": [lambda p=p: lame(1.0, p) for p in (0.5, torch.tensor([0.2, 0.7]))],
     "bodies": [lambda: solver(bodies=())],
     "gravity": [
-        *(lambda g=g: solver(gravity=g) for g in (-9.8, (0.0, -1e30), torch.tensor([1e30, 0.0]))),
+        *(lambda g=g: solver(gravity=g) for g in (-9.8, np.array(-9.8), (0.0, -1e30), torch.tensor([1e30, 0.0]))),
         *(lambda g=g: solver(gravity=torch.zeros(g)) for g in ((), (3,), (5, 5), (1, 1, 2), 0, (0, 2))),
         *(lambda g=g: solver(gravity=g) for g in (torch.zeros(2) * 1j, torch.zeros(2) == 1, torch.tensor([0.0, NAN]))),
         lambda: solver(gravity=torch.zeros(3, 2)).step(lively(5, 2)),
@@ -147,7 +147,10 @@ VALUES = {
         *(lambda a=a: robot(5).stable_dt(a) for a in (NAN, "strong", torch.tensor([1.0, INF]))),
     ],
     "stiffness() of bodies[0].material": [lambda: solver(bodies=(body(material=Endless(300.0, 80.0)),))],
-    "other": [lambda s=s: lively(5).where(torch.tensor([True]), s) for s in (lively(5, 3), lively(4))],
+    "other": [
+        lambda s=s: lively(5).where(torch.tensor([True]), s)
+        for s in (lively(5, 3), lively(4), lively(5).to(torch.float32))
+    ],
     "origin": [lambda: step(origin=torch.zeros(2).double())],
     "x": [
         *(lambda s=s: state(x=torch.zeros(s)) for s in ((5, 3), (5,), (2, 5, 1), (1, 2, 5, 2))),

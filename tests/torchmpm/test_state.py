@@ -67,7 +67,7 @@ def test_integer_index_keeps_the_batch_dimension() -> None:
 @pytest.mark.parametrize(
     "index",
     [
-        *(3, -4, None, torch.tensor(True), torch.tensor(1.5), torch.tensor(3)),
+        *(3, -4, None, "x", torch.tensor(True), torch.tensor(1.5), torch.tensor(3)),
         *(True, False, np.bool_(True), (0, 1), (0,), (slice(None), slice(0, 1)), (slice(None), 0)),
     ],
 )

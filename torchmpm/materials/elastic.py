@@ -39,8 +39,8 @@ class Elastic:
         lam: First Lame parameter, Pa; negative for a negative Poisson's ratio, but not below -mu.
 
     Raises:
-        ValueError: ``mu`` is negative, or ``lam`` below -mu (for a tensor: when a
-            solver with ``allow_unstable=False`` is made).
+        ValueError: ``mu`` is negative, or ``lam`` below -mu (for a tensor: when a solver with ``allow_unstable=False``
+            is made).
     """
 
     mu: Value

@@ -19,7 +19,7 @@ from torchmpm.materials.body import Body
 from torchmpm.native.cuda.compiler import unavailable
 from torchmpm.native.cuda.launcher import CUDA
 from torchmpm.native.library import POOL, load, thread_pool
-from torchmpm.native.tables import KINDS, Inputs, Tables, make_tables, make_values, upload
+from torchmpm.native.tables import COTANGENTS, KINDS, Inputs, Tables, make_tables, make_values, members, upload
 from torchmpm.state import ParticleState
 
 #: A node remembers its rule for each direction in one byte, in which 0 stands for none.
@@ -210,20 +210,16 @@ def _sum_shared(bar: Tensor, values: Tensor, tables: Tables) -> Tensor:
     return torch.cat(columns, dim=2)
 
 
-#: Derivatives that the adjoint in C++ writes.
-COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
-
-
 class Call(ctypes.Structure):
     """The arguments of a call into C++, as ``struct Call`` in ``scene.hpp``."""
 
     _fields_ = [
-        *((name, ctypes.c_int64) for name in ("batch", "particles", "substeps", "threads")),
-        *((name, ctypes.c_void_p) for name in POOL),
+        *members(ctypes.c_int64, "batch", "particles", "substeps", "threads"),
+        *members(ctypes.c_void_p, *POOL),
         ("tables", ctypes.POINTER(Tables)),
-        *((name, ctypes.c_void_p) for name in ("components", "field", "origin", "shift", "gravity", "values")),
-        *((name, ctypes.c_int64) for name in ("values_batch", "columns")),
-        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *COTANGENTS)),
+        *members(ctypes.c_void_p, "components", "field", "origin", "shift", "gravity", "values"),
+        *members(ctypes.c_int64, "values_batch", "columns"),
+        *members(ctypes.c_void_p, "result", "result_bar", *COTANGENTS),
     ]
 
 
@@ -248,19 +244,20 @@ def call(name: str, inputs: Inputs, tables: Tables, substeps: int, **outputs: Te
             raise MemoryError("backend 'native' ran out of memory")
 
 
-_kept: list[Tensor] = []
+#: Scratch memory that no call is using.
+_free_scratch: list[Tensor] = []
 
 
 @contextmanager
 def _scratch(size: int) -> Iterator[int]:
     """Address of ``size`` bytes of aligned memory."""
     try:
-        buffer = _kept.pop()
+        buffer = _free_scratch.pop()
     except IndexError:
         buffer = torch.empty(0, dtype=torch.uint8, device="cpu")
     if buffer.numel() < size + 64:
         del buffer
         buffer = torch.empty(size + 64, dtype=torch.uint8, device="cpu")
     yield (buffer.data_ptr() + 63) // 64 * 64
-    if buffer.numel() <= KEPT_BYTES and not _kept:
-        _kept.append(buffer)
+    if buffer.numel() <= KEPT_BYTES and not _free_scratch:
+        _free_scratch.append(buffer)

@@ -242,7 +242,7 @@ def _pool() -> dict[str, int]:
 def leave_parent_threads() -> None:
     """In a forked process that is about to compute for the first time, compute with one thread from now on.
 
-    The threads of its parent are not there, but GNU OpenMP would wait for them for ever. Forked processes that do not
+    The threads of its parent are not there, but GNU OpenMP would wait for them forever. Forked processes that do not
     use this package keep their number of threads.
     """
     global _forked

@@ -22,9 +22,12 @@ from torchmpm.tree import cached_tensors
 KINDS: tuple[type, ...] = (Elastic, VonMises, Snow)
 #: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
 VALUES = 8
+#: What the adjoint computes: derivatives in the tensors of :class:`Inputs`, see :meth:`Inputs.empty_cotangents`.
+COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
-def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
+def members(kind: Any, *names: str) -> list[tuple[str, Any]]:
+    """Entries of ``_fields_`` for members of a ``ctypes.Structure`` that have one type."""
     return [(name, kind) for name in names]
 
 
@@ -38,8 +41,8 @@ class BodyTable(ctypes.Structure):
     """
 
     _fields_ = [
-        *_members(ctypes.c_int64, "first", "count", "kind", "muscle", "varying", "column"),
-        *_members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff", "resolved_rate"),
+        *members(ctypes.c_int64, "first", "count", "kind", "muscle", "varying", "column"),
+        *members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff", "resolved_rate"),
     ]
 
 
@@ -52,8 +55,8 @@ class RuleTable(ctypes.Structure):
     """
 
     _fields_ = [
-        *_members(ctypes.c_int64, "axis", "world", "slot"),
-        *_members(ctypes.c_double, "sign", "i_low", "i_high", "j_low", "j_high", "friction"),
+        *members(ctypes.c_int64, "axis", "world", "slot"),
+        *members(ctypes.c_double, "sign", "i_low", "i_high", "j_low", "j_high", "friction"),
     ]
 
 
@@ -61,8 +64,8 @@ class Tables(ctypes.Structure):
     """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``)."""
 
     _fields_ = [
-        *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
-        *_members(ctypes.c_double, "h", "dt", "margin", "extent", "damping", "mass_epsilon", "stretch_floor"),
+        *members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
+        *members(ctypes.c_double, "h", "dt", "margin", "extent", "damping", "mass_epsilon", "stretch_floor"),
         ("bodies", ctypes.POINTER(BodyTable)),
         ("rules", ctypes.POINTER(RuleTable)),
     ]
@@ -80,9 +83,9 @@ class Inputs(NamedTuple):
     result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new components, for the adjoint
 
     def empty_cotangents(self, wants_field: bool, wants_values: bool) -> tuple[Tensor, ...]:
-        """Room for derivatives in components, field, origin and gravity, in their shapes, and in the values.
+        """Memory for :data:`COTANGENTS`, in the shapes of components, field, origin and gravity.
 
-        The last has the shape (8, B, N), a column for each particle. Those that are not wanted are empty.
+        That of the values has the shape (8, B, N), a column for each particle. Those that are not wanted are empty.
         """
         components, field = self.components, self.field
         return (

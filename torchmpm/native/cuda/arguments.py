@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from torchmpm.grid import PAD
+from torchmpm.native.tables import COTANGENTS, members
 
 #: 32-bit counters of a team, which must be zero before a launch of a global kernel.
 COUNTERS = 64
@@ -32,10 +33,6 @@ SHARES = 16
 SUMMARY = 8
 
 
-def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names]
-
-
 class Arguments(ctypes.Structure):
     """The only argument of each kernel, as ``struct Arguments``.
 
@@ -43,14 +40,14 @@ class Arguments(ctypes.Structure):
     """
 
     _fields_ = [
-        *_members(ctypes.c_int64, "batch", "particles", "substeps", "resolution", "num_bodies", "num_rules"),
-        *_members(ctypes.c_int64, "rows", "columns", "team", "values_batch", "value_columns", "scratch_bytes"),
-        *_members(ctypes.c_double, "h", "dt", "margin", "extent", "damping", "mass_epsilon", "stretch_floor"),
-        *_members(ctypes.c_void_p, "bodies", "rules"),
-        *_members(ctypes.c_void_p, "components", "field", "origin", "shift", "gravity", "values"),
-        *_members(ctypes.c_void_p, "result", "result_bar"),
-        *_members(ctypes.c_void_p, "components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar"),
-        *_members(ctypes.c_void_p, "status", "counters", "scratch"),
+        *members(ctypes.c_int64, "batch", "particles", "substeps", "resolution", "num_bodies", "num_rules"),
+        *members(ctypes.c_int64, "rows", "columns", "team", "values_batch", "value_columns", "scratch_bytes"),
+        *members(ctypes.c_double, "h", "dt", "margin", "extent", "damping", "mass_epsilon", "stretch_floor"),
+        *members(ctypes.c_void_p, "bodies", "rules"),
+        *members(ctypes.c_void_p, "components", "field", "origin", "shift", "gravity", "values"),
+        *members(ctypes.c_void_p, "result", "result_bar"),
+        *members(ctypes.c_void_p, *COTANGENTS),
+        *members(ctypes.c_void_p, "status", "counters", "scratch"),
     ]
 
 

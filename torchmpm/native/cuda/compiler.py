@@ -67,7 +67,7 @@ def compile_kernel(kernel: Kernel, arch: str) -> bytes:
 
 
 def source_of(kernel: Kernel) -> str:
-    """The text of a kernel."""
+    """The source code of a kernel."""
     return path_of(kernel).read_text(encoding="utf-8")
 
 

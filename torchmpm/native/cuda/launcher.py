@@ -10,11 +10,9 @@ from torch import Tensor
 from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel, kinds_of
 from torchmpm.native.cuda.driver import Cuda, Driver, Launch
 from torchmpm.native.cuda.plan import Call, Pass, passes
-from torchmpm.native.tables import BodyTable, Inputs, RuleTable, Tables
+from torchmpm.native.tables import COTANGENTS, BodyTable, Inputs, RuleTable, Tables
 
 REAL = {torch.float32: "float", torch.float64: "double"}
-#: Derivatives that the adjoint writes, in the order of :meth:`Inputs.empty_cotangents`.
-COTANGENTS = ("components_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
 class Launcher:
