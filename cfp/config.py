@@ -266,9 +266,8 @@ class StagedConfig(RunConfig):
         for option in dataclasses.fields(self):
             if option.name != "handover" and getattr(self, option.name) == ():
                 raise ConfigError(f"{option.name} must have at least one value")
-        self.actor_spec(len(self.resolutions))  # checks the resolutions
+        self.actor_spec(len(self.resolutions))  # checks its fields
         check_at_least(1, steps=self.steps)
-        check_positive(gate_scale=self.gate_scale)
         if len(self.handover) < (count := len(self.resolutions) - 1):
             raise ConfigError(
                 f"handover must have {count} values for resolutions {self.resolutions}, got {self.handover}"

@@ -21,14 +21,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cfp.agent.pixels import fill_missing
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_positive
 from dittogym.action import bicubic
 from dittogym.geometry import NODES
 from dittogym.observation import SIZE
 
 Interpolation = Literal["half_pixel", "aligned"]
 EncoderKind = Literal["paper", "small"]
-ENCODERS: tuple[EncoderKind, ...] = get_args(EncoderKind)
 
 #: Rows and columns of the observation, and of actions as input of the paper's encoders.
 IMAGE_SIZE = SIZE
@@ -71,8 +70,8 @@ class ActorSpec:
         fill_missing: Missing pixels of an image are filled from those around them, see `cfp.agent.pixels`.
 
     Raises:
-        ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
-            match them.
+        ConfigError: A resolution has no decoder, resolutions do not increase, ``gate_bias`` or ``patch`` do not match
+            them, ``gate_scale`` is not positive, or there is no such encoder or interpolation.
     """
 
     resolutions: tuple[int, ...]
@@ -85,9 +84,11 @@ class ActorSpec:
     fill_missing: bool = False
 
     def __post_init__(self) -> None:
-        """Check that the fields match each other."""
-        if self.encoder not in ENCODERS:
-            raise ConfigError(f"encoder must be {' or '.join(ENCODERS)}, got {self.encoder!r}")
+        """Check the fields, also against each other."""
+        for name, kind in (("encoder", EncoderKind), ("interpolation", Interpolation)):
+            if (value := getattr(self, name)) not in (allowed := get_args(kind)):
+                raise ConfigError(f"{name} must be {' or '.join(allowed)}, got {value!r}")
+        check_positive(gate_scale=self.gate_scale)
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
             given = f"{self.resolutions}; by default they follow from the task's coarse and fine"
