@@ -176,7 +176,7 @@ class Episodes(Resumable):
         env.reset(seed=[self.first_seed + i % self.num_layouts for i in range(count)])
         self.max_steps = min(max_episode_steps, env.spec.horizon)
         self.limit = first_limits(count, self.max_steps, env.device)
-        self.returns = torch.zeros(count, device=env.device)
+        self.returns = torch.zeros(count, dtype=env.dtype, device=env.device)
         self.recent_returns: list[float] = []  # undiscounted; of the episodes since the list was last emptied
         self.num_started = count
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
