@@ -242,7 +242,7 @@ class UpdateLoop(BaseAlgorithm, Learner):
     def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""
         self.num_timesteps += len(done)
-        self._callback.update_locals({"dones": np.asarray(done), "infos": infos})
+        self._callback.update_locals({"dones": done, "infos": infos})
         return self._callback.on_step()
 
     def record(self, scalars: Scalars) -> None:

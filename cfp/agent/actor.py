@@ -281,9 +281,8 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
         if isinstance(layers[0], nn.ELU):
             values = layers[0](values)
             continue
-        blocks = torch.block_diag(
-            *(layer.weight.flatten(1) for layer in layers)
-        )  # each continues with its own channels
+        # Each head continues with its own channels.
+        blocks = torch.block_diag(*(layer.weight.flatten(1) for layer in layers))
         weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
         bias = torch.cat([layer.bias for layer in layers])
         values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
@@ -435,10 +434,6 @@ def standard_deviation(raw_std: Tensor) -> Tensor:
     return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
 
 
-def _normal_like(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, generator=generator, device=generator.device).to(like)
-
-
 def sample_squashed_gaussian(
     mean: Tensor,
     raw_std: Tensor,
@@ -450,9 +445,12 @@ def sample_squashed_gaussian(
     A ``generator``, if given, may belong to the CPU, whatever the device of the networks.
     """
     std = standard_deviation(raw_std)
-    noise = torch.zeros_like(mean)
-    if not deterministic:
-        noise = noise.normal_() if generator is None else _normal_like(mean, generator)
+    if deterministic:
+        noise = torch.zeros_like(mean)
+    elif generator is None:
+        noise = torch.randn_like(mean)
+    else:
+        noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 

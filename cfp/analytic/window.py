@@ -274,7 +274,6 @@ class WindowCollector(Resumable):
             ConfigError: A GPU has too little free memory for the gradients of a window.
         """
         env, true_reward = self.env, 0.0
-        self._dropped_now = torch.zeros_like(self._dropped_now)
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
         for _ in range(self.config.window):
