@@ -23,7 +23,7 @@ from dittogym.tasks import task_name
 Preset = Literal["quick", "long", "paper"]
 #: Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object.
 Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
-Options = TypeVar("Options")
+Value = TypeVar("Value")
 
 LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
@@ -47,7 +47,7 @@ class EnvironmentConfig:
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the physics."""
     backend: str = "auto"
-    """Backend of the physics: auto, eager, ..."""
+    """Implementation of the physics: native (C++ or CUDA kernels), eager (PyTorch), or auto, which chooses."""
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
@@ -576,7 +576,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         check_positive(action_step=min(self.action_step))
 
 
-def of_stage(values: tuple[Options, ...], stage: int) -> Options:
+def of_stage(values: tuple[Value, ...], stage: int) -> Value:
     """Value of a stage, counted from 1; the last one holds for all further stages."""
     return values[min(stage, len(values)) - 1]
 
@@ -620,7 +620,7 @@ def to_words(options: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def update_from_dict(base: Options, values: Any) -> Options:
+def update_from_dict(base: Value, values: Any) -> Value:
     """Replace fields of a dataclass by JSON values, whose types are checked; lists become tuples.
 
     Raises:

@@ -26,7 +26,7 @@ from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
-from cfp.hub import SCHEME, Shareable, download
+from cfp.hub import Shareable, download, is_address
 from dittogym import TorchEnv, make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES
@@ -250,7 +250,7 @@ def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {brief(path)}")
-    if str(path).startswith(SCHEME):
+    if is_address(path):
         return download(str(path))
     file = Path(path)
     if file.is_dir():
