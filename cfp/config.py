@@ -14,7 +14,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 import dittogym.tasks
 from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
-from cfp.errors import ConfigError, brief, check_at_least, check_decay, check_fraction, check_positive
+from cfp.errors import ConfigError, brief, check_at_least, check_below_one, check_fraction, check_positive
 from dittogym import Conditions, make_spec
 from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
@@ -331,7 +331,7 @@ class VariationConfig(StagedConfig):
         super().check()
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
-        check_decay(vary_physics=self.vary_physics)
+        check_below_one(vary_physics=self.vary_physics)
         for option in dataclasses.fields(VariationConfig):
             given = getattr(self, option.name)
             if not self.vary and option.name.startswith("vary_") and given != option.default:
@@ -393,7 +393,7 @@ class LearningConfig:
         if self.n_steps > 1 and self.gamma == 1:
             raise ConfigError("gamma must be below 1 with several n_steps, got 1")
         check_fraction(gamma=self.gamma, tau=self.tau, final_rate=self.final_rate)
-        check_decay(weight_average=self.weight_average)
+        check_below_one(weight_average=self.weight_average)
         check_positive(learning_rate=self.learning_rate)
 
 
@@ -461,7 +461,7 @@ class SACConfig(LearningConfig, CoarseToFineConfig):
         """Check what the types do not express."""
         super().check()
         for share in self.critics_first:
-            check_decay(critics_first=share)
+            check_below_one(critics_first=share)
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)
         for stage in range(1, len(self.resolutions) + 1):
@@ -572,7 +572,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
         check_at_least(1, windows_kept=self.windows_kept)
         check_fraction(final_step=self.final_step)
-        check_decay(weight_average=self.weight_average)
+        check_below_one(weight_average=self.weight_average)
         check_positive(action_step=min(self.action_step))
 
 
