@@ -51,6 +51,8 @@ SEEDS = range(3_000_000_000, 3_000_000_008)
 COUNTS = range(2000, 1680, -40)
 #: Largest difference of scores, which are rounded to three decimals, from those that the episodes give.
 TOLERANCE = 0.0015
+#: What a file of results states of the training, in numbers.
+TRAINING = ("steps", "minutes")
 #: A file of results: its entries and their types.
 ENTRIES: dict[str, Any] = {
     "protocol": str,
@@ -58,7 +60,7 @@ ENTRIES: dict[str, Any] = {
     "policy": str,  # the name that is shown
     "sha256": str | None,  # of the policy file; None for reference policies
     "sees": str,
-    "training": dict,  # steps and minutes, teachers included, as the submitter states them; None if not known
+    "training": dict,  # `TRAINING`, teachers included, as the submitter states them; None if not known
     "library": str,  # version that played the episodes
     "returns": list,  # undiscounted, one per layout
     "successes": list,  # as many
@@ -171,9 +173,12 @@ def read_results(path: Path) -> dict[str, Any]:
         if len(row[name]) != len(SEEDS) or not all(isinstance(value, kinds) for value in row[name]):
             raise ConfigError(f"{path}: {name} must have {len(SEEDS)} values, one per layout, got {row[name]}")
     for name, value in scores(row["returns"], row["successes"]).items():
-        if not abs(row["scores"].get(name, np.nan) - value) <= TOLERANCE:  # NaN is wrong, too
-            given = row["scores"].get(name)
-            raise ConfigError(f"{path}: scores.{name} must be {value:.3f}, as the episodes give, got {given}")
+        given = row["scores"].get(name)
+        if not (isinstance(given, int | float) and abs(given - value) <= TOLERANCE):  # NaN is wrong, too
+            raise ConfigError(f"{path}: scores.{name} must be {value:.3f}, as the episodes give, got {given!r}")
+    for name in TRAINING:
+        if not isinstance(value := row["training"].get(name), int | float | None):
+            raise ConfigError(f"{path}: training.{name} must be a number or null, got {value!r}")
     return row
 
 
@@ -184,7 +189,7 @@ def is_reference(row: dict[str, Any]) -> bool:
 
 def rankings(results: Iterable[dict[str, Any]]) -> list[Table]:
     """A table for every task that has results, named by the task; reference policies come last and have no rank."""
-    rows = [row | row["training"] | row["scores"] for row in results]
+    rows = [row | {name: row["training"].get(name) for name in TRAINING} | row["scores"] for row in results]
     rows.sort(key=lambda row: (is_reference(row), SEES.index(row["sees"]), -row["mean"]))
     for row in rows:
         rivals = [other for other in rows if (other["task"], other["sees"]) == (row["task"], row["sees"])]

@@ -14,7 +14,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 import dittogym.tasks
 from cfp.agent.actor import RESOLUTIONS, ActorSpec, EncoderKind, Interpolation
-from cfp.errors import ConfigError, brief, check_at_least, check_decay, check_fraction, check_positive
+from cfp.errors import ConfigError, brief, check_at_least, check_below_one, check_fraction, check_positive
 from dittogym import Conditions, make_spec
 from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT, TaskSpec
@@ -23,7 +23,7 @@ from dittogym.tasks import task_name
 Preset = Literal["quick", "long", "paper"]
 #: Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object.
 Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
-Options = TypeVar("Options")
+Value = TypeVar("Value")
 
 LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
@@ -47,7 +47,7 @@ class EnvironmentConfig:
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the physics."""
     backend: str = "auto"
-    """Backend of the physics: auto, eager, ..."""
+    """Implementation of the physics: native (C++ or CUDA kernels), eager (PyTorch), or auto, which chooses."""
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
@@ -266,9 +266,8 @@ class StagedConfig(RunConfig):
         for option in dataclasses.fields(self):
             if option.name != "handover" and getattr(self, option.name) == ():
                 raise ConfigError(f"{option.name} must have at least one value")
-        self.actor_spec(len(self.resolutions))  # checks the resolutions
+        self.actor_spec(len(self.resolutions))  # checks its fields
         check_at_least(1, steps=self.steps)
-        check_positive(gate_scale=self.gate_scale)
         if len(self.handover) < (count := len(self.resolutions) - 1):
             raise ConfigError(
                 f"handover must have {count} values for resolutions {self.resolutions}, got {self.handover}"
@@ -332,7 +331,7 @@ class VariationConfig(StagedConfig):
         super().check()
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
-        check_decay(vary_physics=self.vary_physics)
+        check_below_one(vary_physics=self.vary_physics)
         for option in dataclasses.fields(VariationConfig):
             given = getattr(self, option.name)
             if not self.vary and option.name.startswith("vary_") and given != option.default:
@@ -394,7 +393,7 @@ class LearningConfig:
         if self.n_steps > 1 and self.gamma == 1:
             raise ConfigError("gamma must be below 1 with several n_steps, got 1")
         check_fraction(gamma=self.gamma, tau=self.tau, final_rate=self.final_rate)
-        check_decay(weight_average=self.weight_average)
+        check_below_one(weight_average=self.weight_average)
         check_positive(learning_rate=self.learning_rate)
 
 
@@ -462,7 +461,7 @@ class SACConfig(LearningConfig, CoarseToFineConfig):
         """Check what the types do not express."""
         super().check()
         for share in self.critics_first:
-            check_decay(critics_first=share)
+            check_below_one(critics_first=share)
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)
         for stage in range(1, len(self.resolutions) + 1):
@@ -573,11 +572,11 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
         check_at_least(1, windows_kept=self.windows_kept)
         check_fraction(final_step=self.final_step)
-        check_decay(weight_average=self.weight_average)
+        check_below_one(weight_average=self.weight_average)
         check_positive(action_step=min(self.action_step))
 
 
-def of_stage(values: tuple[Options, ...], stage: int) -> Options:
+def of_stage(values: tuple[Value, ...], stage: int) -> Value:
     """Value of a stage, counted from 1; the last one holds for all further stages."""
     return values[min(stage, len(values)) - 1]
 
@@ -621,7 +620,7 @@ def to_words(options: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def update_from_dict(base: Options, values: Any) -> Options:
+def update_from_dict(base: Value, values: Any) -> Value:
     """Replace fields of a dataclass by JSON values, whose types are checked; lists become tuples.
 
     Raises:

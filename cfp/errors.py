@@ -53,8 +53,8 @@ def check_fraction(**values: float) -> None:
             raise ConfigError(f"{name} must be between 0 and 1, got {value}")
 
 
-def check_decay(**values: float) -> None:
-    """Check that each value, given by the name of its option, is at least 0 and below 1, as decays of averages are."""
+def check_below_one(**values: float) -> None:
+    """Check that each value, given by the name of its option, lies in [0, 1); NaN is refused."""
     for name, value in values.items():
         if not 0 <= value < 1:
             raise ConfigError(f"{name} must be at least 0 and less than 1, got {value}")

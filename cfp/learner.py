@@ -217,7 +217,8 @@ class UpdateLoop(BaseAlgorithm, Learner):
     ) -> UpdateLoop:
         """Take at least ``total_timesteps`` environment steps, see stable-baselines3; rows are logged by update.
 
-        Rates fall with the steps that the options give the stage, however many are taken here.
+        Rates fall over the steps that the options give the stage, or over those that are taken if they are more, as in
+        a second stage that is prolonged.
         """
         resets = reset_num_timesteps or self._last_obs is None  # as `_setup_learn` does
         total, self._callback = self._setup_learn(
@@ -226,10 +227,10 @@ class UpdateLoop(BaseAlgorithm, Learner):
         if resets:
             self.begin_episodes()
         self._callback.on_training_start(locals(), globals())
-        updates = 0
+        updates, end = 0, max(total, self.config.stage_steps(self.stage))
         while self.num_timesteps < total:
             self._callback.on_rollout_start()
-            self.progress = min(self.num_timesteps / self.config.stage_steps(self.stage), 1.0)
+            self.progress = self.num_timesteps / end
             if not self.update():
                 break
             updates += 1
@@ -242,7 +243,7 @@ class UpdateLoop(BaseAlgorithm, Learner):
     def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""
         self.num_timesteps += len(done)
-        self._callback.update_locals({"dones": np.asarray(done), "infos": infos})
+        self._callback.update_locals({"dones": done, "infos": infos})
         return self._callback.on_step()
 
     def record(self, scalars: Scalars) -> None:

@@ -26,7 +26,7 @@ from cfp.agent.actor import RESOLUTIONS, Actor, ActorSpec, build_actor
 from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig, update_from_dict
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
-from cfp.hub import SCHEME, Shareable, download
+from cfp.hub import Shareable, download, is_address
 from dittogym import TorchEnv, make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES
@@ -136,11 +136,14 @@ class ActorPolicy(nn.Module, Shareable):
         For gradients with respect to an image call ``actor``, which takes floating-point ones in [-1, 1].
 
         Raises:
-            ValueError: The observation is not uint8.
+            ValueError: The observation has another type or shape.
         """
-        if observation.dtype != torch.uint8:
-            kind = str(observation.dtype).removeprefix("torch.")
-            raise ValueError(f"observation must be uint8, got {kind}; policy.actor takes images in [-1, 1]")
+        if observation.dtype != torch.uint8 or observation.shape[1:] != SHAPE:
+            kind, shape = str(observation.dtype).removeprefix("torch."), tuple(observation.shape)
+            raise ValueError(
+                f"observation must be uint8 of shape (B, 3, 64, 64), got {kind} of shape {shape}; policy.actor takes "
+                "images in [-1, 1]"
+            )
         action: Tensor = self.actor(self.spec.filled(observation), deterministic)
         return action
 
@@ -165,31 +168,35 @@ class ActorPolicy(nn.Module, Shareable):
         Raises:
             ValueError: The observation is neither an image nor a batch of images.
         """
-        check_images(observation)
-        assert isinstance(observation, np.ndarray)
-        action, _ = self.predict_with_gate(observation.reshape(-1, *SHAPE), deterministic)
-        return action if observation.ndim == 4 else action[0], state
+        return self.predict_with_gate(observation, deterministic)[0], state
 
     @torch.no_grad()
     def predict_with_gate(
-        self, observation: np.ndarray, deterministic: bool = False
+        self, observation: Observation, deterministic: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Choose actions, and show how the last stage blends them with those of the coarser one.
 
         Args:
-            observation: (B, 3, 64, 64) uint8.
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
             deterministic: Act without noise.
 
         Returns:
-            Actions (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage (B, 2, R, R), 0
-            where the coarser action is kept; ``None`` for a policy of one stage.
+            Actions (2, A, A) or (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage
+            (2, R, R) or (B, 2, R, R), 0 where the coarser action is kept; ``None`` for a policy of one stage.
+
+        Raises:
+            ValueError: The observation is neither an image nor a batch of images.
         """
+        check_images(observation)
         # A copy: torch takes no negative strides, as of a mirrored image, and warns of arrays that are read-only.
-        batch = torch.as_tensor(np.array(observation, order="C"), device=next(self.parameters()).device)
-        sample = self.actor.sample(self.spec.filled(batch), deterministic)
+        images = torch.as_tensor(np.array(observation, order="C"), device=next(self.parameters()).device)
+        sample = self.actor.sample(self.spec.filled(images.reshape(-1, *SHAPE)), deterministic)
         # This rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space.
         action: np.ndarray = (sample.action.cpu().numpy() + 1) - 1
-        return action, None if sample.gate is None else sample.gate.cpu().numpy()
+        gate = None if sample.gate is None else sample.gate.cpu().numpy()
+        if images.ndim == 3:
+            return action[0], None if gate is None else gate[0]
+        return action, gate
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> ActorPolicy:
@@ -243,7 +250,7 @@ def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {brief(path)}")
-    if str(path).startswith(SCHEME):
+    if is_address(path):
         return download(str(path))
     file = Path(path)
     if file.is_dir():

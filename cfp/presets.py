@@ -227,14 +227,16 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
     """``quick`` and ``long``: many small robots, small networks, coarser actions first."""
     task, quick = paper.task, name == "quick"
     horizon, many = dittogym.make_spec(task).horizon, task in MANY_UPDATES
-    # a longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone
-    steps = (48_000 if many else 38_400) if quick else 320_000  # one seed of RUN gained nothing from more coarse ones
+    quick_steps, quick_handover = 48_000 if many else 38_400, 0.75
+    # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. One seed of
+    # RUN gained nothing from more steps of the first stage.
+    steps = quick_steps if quick else 320_000
     coarse = paper.resolutions[0]
     options: dict[str, Any] = {
         "preset": name,
         "seed": 0,
         "steps": steps,
-        "handover": (0.75 if quick else 0.5,),
+        "handover": (quick_handover if quick else 0.5,),
         "resolutions": (coarse // 2, coarse) if coarse > 4 else paper.resolutions,
         "random_steps": (480, 100),
         "alpha": (0.5 * paper.alpha[0],),
@@ -265,8 +267,8 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
         "log_every": 320 if quick else 1_600,
     } | SAC.get(task, {})
     if not quick:
-        first = options["critics_first"][0] * (0.75 * (48_000 if many else 38_400))  # steps
-        options |= {"buffer_size": 100_000, "critics_first": (first / (0.5 * steps), 0.05)}
+        critics_alone = options["critics_first"][0] * (quick_handover * quick_steps)
+        options |= {"buffer_size": 100_000, "critics_first": (critics_alone / (0.5 * steps), 0.05)}
     return replace(paper, **options)
 
 

@@ -175,6 +175,8 @@ def fit(
     for name, flag in (("resume", resume), ("quiet", quiet)):
         if not isinstance(flag, bool):
             raise ConfigError(f"{name} must be True or False, got {flag!r}")
+    if on_evaluation is not None and not callable(on_evaluation):
+        raise ConfigError(f"on_evaluation must be a function of a row, got {on_evaluation!r}")
     command = from_python({"task": task, **options}, None if out is None else parse_folder("out", out), resume)
     keep_memory()
     try:

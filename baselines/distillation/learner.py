@@ -302,8 +302,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         config = self.config
         seed = config.seed + (self.stage - 1) * config.num_layouts
         episodes = Episodes(self.simulation, seed, config.max_episode_steps, config.num_layouts)
-        guide, grid = self._make_teacher(), self.spec.resolutions[-1]
-        self.collector = Collector(guide, episodes, SWITCH_EVERY, config.dropout, grid)
+        teacher, grid = self._make_teacher(), self.spec.resolutions[-1]
+        self.collector = Collector(teacher, episodes, SWITCH_EVERY, config.dropout, grid)
         self.dataset, self.rounds = Dataset(), 0
         self._last_obs = self.simulation.observation().cpu().numpy()
 

@@ -13,7 +13,7 @@ from baselines.modular.segments import Nodes, SegmentedEnv
 from cfp.config import Hyperparameters, LearningConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.errors import ConfigError, check_at_least, check_decay
+from cfp.errors import ConfigError, check_at_least, check_below_one
 from cfp.learner import Sees
 from cfp.presets import sac_preset
 from cfp.sac.learner import SACLearner
@@ -78,7 +78,7 @@ class ModularConfig(LearningConfig, RunConfig):
             )
         super().check()
         check_at_least(1, steps=self.steps)
-        check_decay(critics_first=self.critics_first)
+        check_below_one(critics_first=self.critics_first)
         self.hyperparameters(1).check()
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
-from cfp.errors import ConfigError, check_decay, check_positive
+from cfp.errors import ConfigError, check_below_one, check_positive
 from dittogym import core
 from dittogym.action import bicubic
 from dittogym.core import EnvState
@@ -40,7 +40,7 @@ class CEMPlannerConfig(PlannerConfig):
         check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites must be between 2 and candidates, {self.candidates}, got {self.elites}")
-        check_decay(noise_correlation=self.noise_correlation, momentum=self.momentum)
+        check_below_one(noise_correlation=self.noise_correlation, momentum=self.momentum)
         if self.noise_grid > resolution:
             raise ConfigError(f"noise_grid must be at most {resolution}, the action grid, got {self.noise_grid}")
 

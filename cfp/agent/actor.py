@@ -21,14 +21,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cfp.agent.pixels import fill_missing
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, check_positive
 from dittogym.action import bicubic
 from dittogym.geometry import NODES
 from dittogym.observation import SIZE
 
 Interpolation = Literal["half_pixel", "aligned"]
 EncoderKind = Literal["paper", "small"]
-ENCODERS: tuple[EncoderKind, ...] = get_args(EncoderKind)
 
 #: Rows and columns of the observation, and of actions as input of the paper's encoders.
 IMAGE_SIZE = SIZE
@@ -71,8 +70,8 @@ class ActorSpec:
         fill_missing: Missing pixels of an image are filled from those around them, see `cfp.agent.pixels`.
 
     Raises:
-        ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
-            match them.
+        ConfigError: A resolution has no decoder, resolutions do not increase, ``gate_bias`` or ``patch`` do not match
+            them, ``gate_scale`` is not positive, or there is no such encoder or interpolation.
     """
 
     resolutions: tuple[int, ...]
@@ -85,9 +84,11 @@ class ActorSpec:
     fill_missing: bool = False
 
     def __post_init__(self) -> None:
-        """Check that the fields match each other."""
-        if self.encoder not in ENCODERS:
-            raise ConfigError(f"encoder must be {' or '.join(ENCODERS)}, got {self.encoder!r}")
+        """Check the fields, also against each other."""
+        for name, kind in (("encoder", EncoderKind), ("interpolation", Interpolation)):
+            if (value := getattr(self, name)) not in (allowed := get_args(kind)):
+                raise ConfigError(f"{name} must be {' or '.join(allowed)}, got {value!r}")
+        check_positive(gate_scale=self.gate_scale)
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
             given = f"{self.resolutions}; by default they follow from the task's coarse and fine"
@@ -280,9 +281,8 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
         if isinstance(layers[0], nn.ELU):
             values = layers[0](values)
             continue
-        blocks = torch.block_diag(
-            *(layer.weight.flatten(1) for layer in layers)
-        )  # each continues with its own channels
+        # Each head continues with its own channels.
+        blocks = torch.block_diag(*(layer.weight.flatten(1) for layer in layers))
         weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
         bias = torch.cat([layer.bias for layer in layers])
         values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
@@ -434,10 +434,6 @@ def standard_deviation(raw_std: Tensor) -> Tensor:
     return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
 
 
-def _normal_like(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, generator=generator, device=generator.device).to(like)
-
-
 def sample_squashed_gaussian(
     mean: Tensor,
     raw_std: Tensor,
@@ -449,9 +445,12 @@ def sample_squashed_gaussian(
     A ``generator``, if given, may belong to the CPU, whatever the device of the networks.
     """
     std = standard_deviation(raw_std)
-    noise = torch.zeros_like(mean)
-    if not deterministic:
-        noise = noise.normal_() if generator is None else _normal_like(mean, generator)
+    if deterministic:
+        noise = torch.zeros_like(mean)
+    elif generator is None:
+        noise = torch.randn_like(mean)
+    else:
+        noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 

@@ -75,12 +75,8 @@ class StateFeatures:
         """Positions (B, N, 2) in cells from the patch's lower left corner."""
         state, spec = env.env_state, env.spec
         width = spec.patch / env.model.solver.grid.resolution
-        centre = (
-            centre_in_window(spec.patch_centre, state.centre, state.origin)
-            .detach()
-            .clamp(0.5 * width, 1.0 - 0.5 * width)
-        )
-        corner = state.origin.detach() + centre - 0.5 * width
+        centre = centre_in_window(spec.patch_centre, state.centre, state.origin).detach()
+        corner = state.origin.detach() + centre.clamp(0.5 * width, 1.0 - 0.5 * width) - 0.5 * width
         return (state.particles.x - corner[:, None]) * (CELLS / width)
 
 

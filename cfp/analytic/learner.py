@@ -209,14 +209,13 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         self.action_step = ActionStep()
         self.empty_windows = 0
         self._last_obs = self.simulation.observation().cpu().numpy()
-        seen = self.observe()
+        seen = self.observe()[:1]
         with torch.no_grad():
-            outputs = self.actor.outputs(seen, deterministic=True, generator=self.generator)
-        example = (seen[0], outputs.location[0])
+            example = (seen[0], self.actor.outputs(seen, deterministic=True).location[0])
         self.memory = ImageMemory(config.windows_kept * config.window * self.n_envs, example)
 
     def observe(self) -> Tensor:
-        """What the policy sees now."""
+        """What the policy sees now, uint8 (B, 3, 64, 64)."""
         return self.config.actor_spec(self.stage).filled(self.simulation.observation())
 
     @staticmethod

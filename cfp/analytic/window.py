@@ -176,7 +176,7 @@ class Episodes(Resumable):
         env.reset(seed=[self.first_seed + i % self.num_layouts for i in range(count)])
         self.max_steps = min(max_episode_steps, env.spec.horizon)
         self.limit = first_limits(count, self.max_steps, env.device)
-        self.returns = torch.zeros(count, device=env.device)
+        self.returns = torch.zeros(count, dtype=env.dtype, device=env.device)
         self.recent_returns: list[float] = []  # undiscounted; of the episodes since the list was last emptied
         self.num_started = count
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
@@ -274,7 +274,6 @@ class WindowCollector(Resumable):
             ConfigError: A GPU has too little free memory for the gradients of a window.
         """
         env, true_reward = self.env, 0.0
-        self._dropped_now = torch.zeros_like(self._dropped_now)
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
         for _ in range(self.config.window):

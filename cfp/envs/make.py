@@ -44,6 +44,15 @@ def _automatic_device() -> str:
     return "cuda" if reason is None else "cpu"
 
 
+def gpu_memory(device: str) -> int | None:
+    """Bytes of memory of the GPU that ``device`` stands for; 0: it is the CPU, None: there is no such GPU."""
+    try:
+        found = choose_device(device)
+    except ConfigError:
+        return None if device.startswith("cuda") else 0
+    return 0 if found == "cpu" else int(torch.cuda.get_device_properties(found).total_memory)
+
+
 def make_env(
     config: RunConfig,
     resolution: int,
@@ -54,15 +63,6 @@ def make_env(
 ) -> VecMonitor:
     """Create the environment of a run for stable-baselines3, see `make_torch_env` and `TorchVecEnv`."""
     return monitored(make_torch_env(config, resolution, num_envs, **changes), max_episode_steps, tensors)
-
-
-def gpu_memory(device: str) -> int | None:
-    """Bytes of memory of the GPU that ``device`` stands for; 0: it is the CPU, None: there is no such GPU."""
-    try:
-        found = choose_device(device)
-    except ConfigError:
-        return None if device.startswith("cuda") else 0
-    return 0 if found == "cpu" else int(torch.cuda.get_device_properties(found).total_memory)
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:

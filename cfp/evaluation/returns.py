@@ -165,31 +165,36 @@ class Trial:
             observation, _ = env.reset(seed=first)
         memory, starts = None, np.ones(count, bool)
         totals = np.zeros(count, np.float32)  # added up as stable-baselines3 does
-        pieces: list[np.ndarray] = []
         terms: dict[str, np.ndarray] = {}
+        pieces: list[np.ndarray] = []
         played: dict[int, Played] = {}
         while len(played) < count:
-            action, memory = acting.predict(as_numpy(observation), memory, starts, deterministic=self.deterministic)
-            if not np.isfinite(action).all():
+            chosen, memory = acting.predict(as_numpy(observation), memory, starts, deterministic=self.deterministic)
+            if not np.isfinite(chosen).all():
                 raise NonFiniteError(DIVERGED)
+            action = to_device(np.array(chosen, np.float32), env.device)
             with torch.no_grad():
-                observation, *own, info = env.step(to_device(np.array(action, np.float32), env.device))
-            found = dict(zip(("reward", "terminated", "truncated"), own, strict=True))
-            own_info = {name: info[name] for name in info.keys() & {"split", "is_success"}}
-            step = to_host(found | own_info | {f"term {name}": value for name, value in info["reward_terms"].items()})
-            totals += step["reward"].astype(np.float32)
+                observation, reward, terminated, truncated, info = env.step(action)
+            step = {"reward": reward, "done": terminated | truncated}
+            step |= {name: info[name] for name in info.keys() & {"split", "is_success"}}
+            values = to_host(step | {f"term {name}": value for name, value in info["reward_terms"].items()})
+            starts = values["done"]
+            totals += values["reward"].astype(np.float32)
             for name in info["reward_terms"]:
-                terms[name] = terms.get(name, 0.0) + step[f"term {name}"]
+                terms[name] = terms.get(name, 0.0) + values[f"term {name}"]
             pieces.append(largest_piece(env.state.x[:, : env.model.num_robot_particles], env.env_state.origin))
-            starts = step["terminated"] | step["truncated"]
             for i in np.flatnonzero(starts).tolist():
-                if i not in played:
-                    limit = env.spec.split_limit
-                    torn = limit is not None and bool(step["split"][i] > limit)
-                    success = bool(step["is_success"][i]) if "is_success" in step else None
-                    share = [piece[i] for piece in pieces]
-                    sums = {name: float(values[i]) for name, values in terms.items()}
-                    played[i] = Played(float(totals[i]), success, torn, float(share[-1]), float(np.mean(share)), sums)
+                if i in played:
+                    continue
+                limit, piece = env.spec.split_limit, [shares[i] for shares in pieces]
+                played[i] = Played(
+                    total=float(totals[i]),
+                    success=bool(values["is_success"][i]) if "is_success" in values else None,
+                    torn=limit is not None and bool(values["split"][i] > limit),
+                    piece=float(piece[-1]),
+                    mean_piece=float(np.mean(piece)),
+                    terms={name: float(sums[i]) for name, sums in terms.items()},
+                )
             if starts.any() and len(played) < count:
                 with torch.no_grad():  # so that what has ended stays a robot, and not what is left of one
                     observation, _ = env.reset(options={"reset_mask": torch.from_numpy(starts)})

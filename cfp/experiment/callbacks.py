@@ -51,8 +51,6 @@ EVALUATION_COLUMNS: dict[str, str] = {
     "highest": "highest return",
     "success": "share of successes, where the task defines success",
 }
-
-
 #: Scalars of an evaluation in TensorBoard.
 EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",

@@ -51,7 +51,7 @@ METRICS: dict[str, str] = {
     "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
-    "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
+    "train/entropy": "mean of -log pi of the sampled (in later stages: residual) action, summed over all 2 R R entries",
     "train/reward_mean": "running mean of rewards (of their sums over n_steps), which is subtracted before learning",
     "train/reward_std": "running standard deviation of the same, by which they are divided",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
@@ -64,7 +64,7 @@ REWARD_MOMENTUM = 0.99
 #: Largest gradient norm of each parameter tensor.
 MAX_GRAD_NORM = 10.0
 #: Of the zeta distribution of the number of steps for which exploration noise is held: exponent, and largest value.
-EXPONENT, LONGEST = 2.0, 16
+HOLD_EXPONENT, LONGEST_HOLD = 2.0, 16
 
 
 def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> Tensor:
@@ -82,9 +82,9 @@ class RewardStatistics(nn.Module):
     ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
     ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
 
-    Where r is a sum over n steps, some sums end early, at the end of an episode or of the memory. Such a sum counts as
-    ``r / w`` in the statistics, and ``w M`` is subtracted from it, where w is the part of the discount factors that it
-    has; otherwise the mean of the missing rewards would be a penalty for the last states of an episode.
+    Where r is a sum over n steps, some sums end early, at the end of an episode or of the memory. Such a sum has a
+    share w of the discount factors ``1 + gamma + ... + gamma^(n-1)``. It counts as ``r / w`` in the statistics, and
+    ``w M`` is subtracted from it; subtracting M would penalise the last states of an episode.
     """
 
     mean: Tensor
@@ -96,12 +96,12 @@ class RewardStatistics(nn.Module):
         self.register_buffer("variance", torch.ones((), dtype=torch.float32))
 
     @torch.no_grad()
-    def forward(self, rewards: Tensor, part: Tensor | float = 1.0) -> Tensor:
-        """Update the statistics with raw rewards of any shape and return them normalised; ``part`` is w."""
-        whole = rewards / part
+    def forward(self, rewards: Tensor, share: Tensor | float = 1.0) -> Tensor:
+        """Update the statistics with raw rewards of any shape and return them normalised; ``share`` is w."""
+        whole = rewards / share
         self.mean.lerp_(whole.mean(), 1 - REWARD_MOMENTUM)
         self.variance.lerp_(whole.var(), 1 - REWARD_MOMENTUM)
-        return (rewards - part * self.mean) / (self.variance.sqrt() + 1e-8)
+        return (rewards - share * self.mean) / (self.variance.sqrt() + 1e-8)
 
     def scalars(self) -> dict[str, Tensor]:
         """Values to log."""
@@ -115,17 +115,17 @@ def critic_target(
     rewards: Tensor,
     not_done: Tensor,
     alpha: Tensor | float,
-    gamma: Tensor | float,
+    discount: Tensor | float,
 ) -> Tensor:
-    """Target of the critics, ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
+    """Target of the critics, ``y = r + c d (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
 
-    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit. Over n steps, r is their
-    discounted sum, and ``gamma`` its n-th power, (B, 1).
+    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit. The ``discount`` d is
+    gamma; where r is the discounted sum of n rewards, it is gamma^n, (B, 1).
     """
     with torch.no_grad():
         sample = actor.sample_for_critic(next_obs)
         q_values = smaller_value(target, next_obs, sample.action)
-        return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
+        return rewards + not_done * discount * (q_values - alpha * sample.log_prob[:, None])
 
 
 def smaller_value(critic: TwinCritic, obs: NetworkInput, action: Tensor) -> Tensor:
@@ -188,7 +188,7 @@ class CellNoise:
         """The noise (n, 2, R, R) of the next step."""
         due = np.flatnonzero(self.left == 0)
         self.values[due] = self.generator.standard_normal((len(due), *self.values.shape[1:]), np.float32)
-        self.left[due] = np.minimum(self.generator.zipf(EXPONENT, len(due)), LONGEST)
+        self.left[due] = np.minimum(self.generator.zipf(HOLD_EXPONENT, len(due)), LONGEST_HOLD)
         self.left -= 1
         blocks = (self.scale * self.values).repeat(self.block, axis=2).repeat(self.block, axis=3)
         return torch.from_numpy(blocks)
@@ -352,13 +352,13 @@ class CFP(SAC):
             obs = obs.detach()
         with torch.no_grad():
             next_obs = self.policy.encode(batch.next_observations)
-        gamma: Tensor | float = self.gamma
-        part: Tensor | float = 1.0
+        discount: Tensor | float = self.gamma
+        share: Tensor | float = 1.0
         if batch.discounts is not None:  # rewards are sums over several steps, of which some end early
-            gamma = batch.discounts
-            part = (1 - gamma) / (1 - self.gamma**self.hyperparameters.n_steps)
-        rewards, not_done = self.reward_statistics(batch.rewards, part), 1 - batch.dones
-        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, gamma)
+            discount = batch.discounts
+            share = (1 - discount) / (1 - self.gamma**self.hyperparameters.n_steps)
+        rewards, not_done = self.reward_statistics(batch.rewards, share), 1 - batch.dones
+        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, discount)
         loss = critic_loss(critic, obs, batch.actions, target_q)
         self._descend(loss, critic.optimizer, "critic")
         scalars = {"critic_loss": loss.detach(), "q_target": target_q.mean()}

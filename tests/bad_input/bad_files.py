@@ -92,7 +92,12 @@ POLICIES = [
     *table((f"policy onto {to!r}", lambda to=to: cfp.load("run", device=to), "device") for to in ("abacus", 1.5)),
     *table((f"policy into {to!r}", lambda to=to: cfp.load("run").save(to), "path") for to in ("run", "run.json")),
     *table((f"run of {given!r}", lambda given=given: cfp.Run(given), "folder") for given in (None, "")),
-    *table([("run resumed perhaps", lambda: cfp.fit("run", resume="x", out="new"), "resume")]),
+    *table(
+        [
+            ("run resumed perhaps", lambda: cfp.fit("run", resume="x", out="new"), "resume"),
+            ("run that tells a number", lambda: cfp.fit("run", on_evaluation=3, out="new"), "on_evaluation"),
+        ]
+    ),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
@@ -109,6 +114,7 @@ POLICIES = [
     policy("with an unknown network", "do not match", "colour is not an", changes={"network": {"colour": 1}}),
     policy("with a grid of 7", "resolutions must be increasing values of", changes={"network": {"resolutions": [7]}}),
     policy("with a patch of a mile", "and 128, got 1000", changes={"network": {"resolutions": [8], "patch": 10**6}}),
+    policy("with a negative gate", "gate_scale must", changes={"network": {"resolutions": [8], "gate_scale": -1.0}}),
     policy("of NaN", "got NaN or infinity", weights=first(lambda tensor: tensor * float("nan"))),
     policy("of other shapes", "do not match", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
     policy(

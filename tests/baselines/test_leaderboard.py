@@ -147,6 +147,8 @@ def test_policies_of_other_tasks_and_damaged_records_are_refused(tmp_path, capsy
         ({"successes": [True] * 8}, "scores.success"),
         ({"scores": {}}, "scores.mean"),
         ({"scores": {"mean": float("nan")}}, "scores.mean"),
+        ({"scores": {"mean": "103.5"}}, "scores.mean"),
+        ({"training": {"steps": "many"}}, "training.steps"),
     ],
 )
 def test_wrong_results_are_named(tmp_path, capsys, changes, named):

@@ -138,3 +138,17 @@ def test_coarser_stages_are_frozen_and_drawn_anew():
 def test_impossible_resolutions_are_refused(resolutions, bias, message):
     with pytest.raises(ValueError, match=message):
         ActorSpec(resolutions, bias)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("encoder", "large", "paper or small"),
+        ("interpolation", "bilinear", "half_pixel or aligned"),
+        ("gate_scale", -0.25, "positive"),
+        ("gate_scale", float("nan"), "positive"),
+    ],
+)
+def test_unknown_networks_and_gates_that_would_be_negative_are_refused(field, value, allowed):
+    with pytest.raises(ValueError, match=f"{field} must be {allowed}, got '?{value}"):
+        ActorSpec((8, 16), (0.0,), **{field: value})

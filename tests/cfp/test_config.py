@@ -206,6 +206,17 @@ def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
     assert evaluation_seed(config) == 20_005
 
 
+def test_returns_in_double_precision_are_restored_to_the_last_bit():
+    def begin():
+        env = dittogym.TorchEnv("run", 2, particles=20, substeps=1, dtype="float64")
+        return Episodes(env, 0, max_episode_steps=9, num_layouts=2)
+
+    episodes, restored = begin(), begin()
+    episodes.record(torch.tensor([0.1, 0.2], dtype=torch.float64), torch.zeros(2, dtype=torch.bool))
+    restored.load_state_dict(episodes.state_dict())
+    assert restored.returns.tolist() == [0.1, 0.2]
+
+
 def test_a_step_keeps_its_duration_with_other_substeps():
     def substeps(**values):
         model = make_env(sac(particles=100, **values), 8, 1).venv.torch_env.model

@@ -94,16 +94,25 @@ def test_a_device_may_be_a_device_of_torch(saved):
 def test_what_is_no_image_is_refused(image, given):
     policy = cfp.load("run")
     whole = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
-    for each in (policy, whole):
+    for predict in (policy.predict, policy.predict_with_gate, whole.predict):
         with pytest.raises(ValueError, match=f"observation must be a uint8 array .*, got {given}"):
-            each.predict(image)
+            predict(image)
+    with pytest.raises(ValueError, match=r"observation must be uint8 of shape \(B, 3, 64, 64\), got"):
+        policy(torch.as_tensor(image))
+
+
+def test_a_single_image_is_a_batch_of_one(saved):
+    policy = cfp.load(saved[0])
+    both = policy.predict_with_gate(images(), deterministic=True)
+    for one, batch in zip(policy.predict_with_gate(images()[0], deterministic=True), both, strict=True):
+        np.testing.assert_allclose(one, batch[0], atol=1e-6)
 
 
 def test_gradients_with_respect_to_an_image_are_those_of_the_actor() -> None:
     """Pixels that are filled in would have none, and images in other units are not what it was trained on."""
     policy, image = cfp.load("run"), torch.from_numpy(images())
     soft = (image / 255 * 2 - 1).requires_grad_()
-    with pytest.raises(ValueError, match="observation must be uint8, got float32"):
+    with pytest.raises(ValueError, match=r"observation must be uint8 .* got float32"):
         policy(soft)
     action = policy.actor(soft, True)
     torch.testing.assert_close(action, policy.actor(image, True))

@@ -19,7 +19,7 @@ from cfp.agent.actor import ActorSpec, Encoded, build_actor, halved, normalise_i
 from cfp.config import Hyperparameters
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.sac.learner import LONGEST, METRICS, CellNoise, critic_target
+from cfp.sac.learner import LONGEST_HOLD, METRICS, CellNoise, critic_target
 from cfp.sac.policies import SmallCritics
 
 ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
@@ -153,7 +153,7 @@ def test_one_update_equals_the_float64_computation(kind, monkeypatch):
     noises = [torch.randn(6, 2, r, r, generator=generator, dtype=torch.float64) for r in sizes]
     queue = iter(noises)
     monkeypatch.setattr("cfp.sac.learner.MAX_GRAD_NORM", LIMIT)
-    monkeypatch.setattr(torch.Tensor, "normal_", lambda noise, generator=None: noise.copy_(next(queue)))
+    monkeypatch.setattr(torch, "randn_like", lambda mean: next(queue).to(mean))
 
     weights, values, targets = doubles(actor, True), doubles(critic, True), doubles(target, False)
     obs, next_obs = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))
@@ -374,7 +374,7 @@ def test_noise_is_equal_in_cells_held_for_steps_and_larger_from_robot_to_robot()
     same = (steps[1:] == steps[:-1]).flatten(2).all(2)
     assert 0.5 < same.float().mean() < 0.8  # zeta: one step in most cases, but many steps are within long spells
     longest = max(len(spell) for row in same.T.tolist() for spell in "".join("01"[held] for held in row).split("0"))
-    assert longest == LONGEST - 1
+    assert longest == LONGEST_HOLD - 1
     state, following = noise.state_dict(), None
     other = CellNoise(4, 8, 2, (0.1, 0.8), seed=1)
     other.load_state_dict(state)
