@@ -176,6 +176,7 @@ class Recording:
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)
             total = returns[min(round(time / self.scene.dt), len(self.rewards))]
+            total = round(total, 1) + 0.0  # without the sign of a negative zero
             total = f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
             caption = f"{self.scene.task}   {self._clock(time)}", f"return {total}   {pace(speed)}"
             yield self._picture(time, options, caption, legend=True)
