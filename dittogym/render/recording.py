@@ -41,7 +41,7 @@ class FilmOptions:
 
     Attributes:
         size: Pixels per side of a picture.
-        rate: Pictures per second of a film.
+        rate: Pictures per second of a film, at least 0.01.
         speed: Of playback, 1 is real time; ``None``: :attr:`Recording.default_speed`.
         zoom: A picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
         muscles: Colour the robot by its muscles: contraction red, expansion blue.
@@ -60,7 +60,7 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         check_view(self.size, self.zoom)
-        checks.number("rate", self.rate, above=0.0)
+        checks.number("rate", self.rate, least=0.01)  # a GIF can show a picture for ten minutes
         if self.speed is not None:
             checks.number("speed", self.speed, above=0.0)
         checks.flag("muscles", self.muscles)
