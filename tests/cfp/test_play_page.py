@@ -19,7 +19,7 @@ class Played:
     def __init__(self, browser: Any, width: int = 1280, task: str = "run", root_path: str = "") -> None:
         self.sessions: list[Session] = []
         self.server = Server(lambda: self._session(task), "secret", port=0, root_path=root_path)
-        self.thread = threading.Thread(target=self.server.run)
+        self.thread = threading.Thread(target=self.server.run, daemon=True)  # a test that fails may not close it
         self.thread.start()
         self.errors: list[str] = []
         self.page = browser.new_page(viewport={"width": width, "height": 800})
