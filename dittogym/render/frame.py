@@ -88,6 +88,12 @@ def pace(speed: float) -> str:
     return f"{factor:.0f} times {word}" if factor >= 9.95 else f"{factor:.2g} times {word}"
 
 
+def written_return(total: float) -> str:
+    """A return as people read it, without a minus before a zero."""
+    total = round(total, 1) + 0.0
+    return f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
+
+
 def png(picture: np.ndarray) -> bytes:
     """A picture (H, W, 3) uint8 RGB as a PNG file."""
     return cv2.imencode(".png", picture[..., ::-1])[1].tobytes()

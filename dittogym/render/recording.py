@@ -17,7 +17,7 @@ from PIL import Image
 from dittogym.action import ActionLayout, trained_layout
 from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
-from dittogym.render.frame import frame, pace
+from dittogym.render.frame import frame, pace, written_return
 from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import REST, Scene, Shot, check_view, describe
 from torchmpm import checks
@@ -175,9 +175,7 @@ class Recording:
         returns = np.cumsum([0.0, *self.rewards])
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)
-            total = returns[min(round(time / self.scene.dt), len(self.rewards))]
-            total = round(total, 1) + 0.0  # without the sign of a negative zero
-            total = f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
+            total = written_return(returns[min(round(time / self.scene.dt), len(self.rewards))])
             caption = f"{self.scene.task}   {self._clock(time)}", f"return {total}   {pace(speed)}"
             yield self._picture(time, options, caption, legend=True)
 
