@@ -298,13 +298,13 @@ def test_a_replay_plays_in_a_browser(recording: Recording, browser: Any, tmp_pat
 
 
 def test_a_replay_shows_what_has_gone_wrong(recording: Recording, browser: Any, tmp_path) -> None:
-    """A robot that has flown away, rewards that are not numbers, and control steps that are no whole milliseconds."""
+    """A robot that has flown away, and rewards that are not numbers; also long names, and steps of part of a ms."""
     far = recording.shots[1]._replace(
         x=recording.shots[1].x * np.float32(1e30), centre=np.full(2, 1e27), view=np.zeros(2)
     )
     wrong = replace(
         recording,
-        scene=replace(recording.scene, dt=3e-4),
+        scene=replace(recording.scene, dt=3e-4, task="a_task_with_such_a_long_name_that_it_takes_two_lines"),
         shots=[recording.shots[0], far._replace(origin=np.full(2, 1e27))],
         rewards=[np.nan],
     )
@@ -313,6 +313,8 @@ def test_a_replay_shows_what_has_gone_wrong(recording: Recording, browser: Any, 
     page.goto(wrong.save(tmp_path / "replay.html", speed=1.0).as_uri())
     page.wait_for_function("document.getElementById('play').textContent === 'Play' && document.body.dataset.ready")
     assert page.inner_text("#return") == "return NaN" and page.inner_text("#about").startswith("1 step of 0.3 ms")
+    page.set_viewport_size({"width": 320, "height": 600})
+    assert page.evaluate("document.documentElement.scrollWidth") == 320
     page.close()
     assert not errors
 
