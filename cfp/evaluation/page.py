@@ -19,6 +19,7 @@ from cfp.config import RunConfig, to_json
 from cfp.evaluation.returns import REPLAYED, Result, to_rows
 from cfp.files import write_atomically, write_text
 from cfp.tables import Table, columns, read_table
+from dittogym.render.frame import written_return
 
 #: Pictures of every evaluation (TensorBoard only), and what they show.
 PICTURES: dict[str, str] = {
@@ -148,8 +149,8 @@ def headline(config: RunConfig, results: Sequence[Result]) -> str:
     """What a run came to: the return of its last policy, of a plan that on its own start, and of zero action."""
     last = [result for result in results if result.name != REPLAYED][-1]
     success = "" if last.success is None else f", success {last.success:.0%}"
-    zero = f"{results[0].name} {results[0].mean:,.0f}"
-    return f"{config.algo} on {config.task}: return {last.mean:,.0f}{success} ({zero})"
+    zero = f"{results[0].name} {written_return(results[0].mean)}"
+    return f"{config.algo} on {config.task}: return {written_return(last.mean)}{success} ({zero})"
 
 
 def write_page(folder: Path, config: RunConfig, results: Sequence[Result], note: str) -> Path:

@@ -71,13 +71,12 @@ def frame(
             canvas.grains(x, body.colour, 0.6 * body.radius)
         else:  # its outer particles lie half their distance below its surface
             canvas.surface(x, colours, max(body.radius, BRIDGE / 2), body.radius / (2 * RADIUS), max(1, size / 400))
-    if caption is not None:
-        canvas.caption(*caption)
+    lines = 1 if caption is None else canvas.caption(*caption)
     if legend:
         entries = [("soil" if body.grains else "object", body.colour) for body in scene.bodies[1:]]
         entries += [("goal", TARGET)] if scene.goal is not None else []
         entries += [("target", TARGET)] if scene.target else []
-        canvas.legend(entries, muscles)
+        canvas.legend(entries, muscles, lines)
     return canvas.image
 
 
@@ -87,6 +86,12 @@ def pace(speed: float) -> str:
         return "real time"
     factor, word = (1 / speed, "slower") if speed < 1 else (speed, "faster")
     return f"{factor:.0f} times {word}" if factor >= 9.95 else f"{factor:.2g} times {word}"
+
+
+def written_return(total: float) -> str:
+    """A return as people read it, without a minus before a zero."""
+    total = round(total, 1) + 0.0
+    return f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
 
 
 def png(picture: np.ndarray) -> bytes:
@@ -241,18 +246,24 @@ class Canvas:
         cover = (radius + 0.5 - distance[edge])[:, None]
         self.image[edge] = self.image[edge] + cover * (np.array(colour, np.float32) - self.image[edge])
 
-    def caption(self, left: str, right: str) -> None:
-        """Write into both upper corners, on a light strip."""
-        font = self.font
-        self.strip(0)
-        self.text(left, (font // 2, font // 6), INK, 0.0)
-        self.text(right, (self.pixels - font // 2, font // 6), INK, 1.0)
+    def caption(self, left: str, right: str) -> int:
+        """Write into both upper corners, on a light strip; where they are too close, one below the other.
 
-    def legend(self, entries: Sequence[tuple[str, tuple[int, ...]]], muscles: bool) -> None:
-        """Colours and what they mean, on a second strip below that of the caption, if the picture has room for it."""
+        Returns the number of lines.
+        """
+        font = self.font
+        end = self.text(left, (font // 2, self.strip(0)), INK, 0.0)
+        if end + font + _text_mask(right, font).shape[1] <= self.pixels - font // 2:
+            self.text(right, (self.pixels - font // 2, font // 6), INK, 1.0)
+            return 1
+        self.text(right, (font // 2, self.strip(1)), INK, 0.0)
+        return 2
+
+    def legend(self, entries: Sequence[tuple[str, tuple[int, ...]]], muscles: bool, line: int = 1) -> None:
+        """Colours and what they mean, on a strip below those of the caption, if the picture has room for it."""
         if self.pixels < 20 * self.font:
             return
-        font, row = self.font, self.strip(1)
+        font, row = self.font, self.strip(line)
         column = font // 2
         if muscles:
             ramp = cv2.resize(MUSCLES[None], (5 * font, font // 2), interpolation=cv2.INTER_LINEAR)
@@ -270,7 +281,8 @@ class Canvas:
         """Lighten a line of the picture for text; returns the row where the text begins."""
         height = 4 * self.font // 3
         part = self.image[number * height : (number + 1) * height]
-        part[:] = cv2.addWeighted(part, 0.2, np.full_like(part, 255), 0.8, 0)
+        if part.size:  # the smallest pictures have no second line
+            part[:] = cv2.addWeighted(part, 0.2, np.full_like(part, 255), 0.8, 0)
         return number * height + self.font // 6
 
     def text(self, text: str, at: tuple[int, int], colour: tuple[int, ...], align: float) -> int:

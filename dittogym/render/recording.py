@@ -17,7 +17,7 @@ from PIL import Image
 from dittogym.action import ActionLayout, trained_layout
 from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
-from dittogym.render.frame import frame, pace
+from dittogym.render.frame import frame, pace, written_return
 from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import REST, Scene, Shot, check_view, describe
 from torchmpm import checks
@@ -41,7 +41,7 @@ class FilmOptions:
 
     Attributes:
         size: Pixels per side of a picture.
-        rate: Pictures per second of a film.
+        rate: Pictures per second of a film, at least 0.01.
         speed: Of playback, 1 is real time; ``None``: :attr:`Recording.default_speed`.
         zoom: A picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
         muscles: Colour the robot by its muscles: contraction red, expansion blue.
@@ -60,7 +60,7 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         check_view(self.size, self.zoom)
-        checks.number("rate", self.rate, above=0.0)
+        checks.number("rate", self.rate, least=0.01)  # a GIF can show a picture for ten minutes
         if self.speed is not None:
             checks.number("speed", self.speed, above=0.0)
         checks.flag("muscles", self.muscles)
@@ -175,8 +175,7 @@ class Recording:
         returns = np.cumsum([0.0, *self.rewards])
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)
-            total = returns[min(round(time / self.scene.dt), len(self.rewards))]
-            total = f"{total:,.1f}" if abs(total) < 1000 else f"{total:,.0f}"
+            total = written_return(returns[min(round(time / self.scene.dt), len(self.rewards))])
             caption = f"{self.scene.task}   {self._clock(time)}", f"return {total}   {pace(speed)}"
             yield self._picture(time, options, caption, legend=True)
 

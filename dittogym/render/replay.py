@@ -43,7 +43,8 @@ def replay_page(
         speed: At which the page begins to play, 1 is real time.
     """
     header, data = encode(scene, shots)
-    header |= {"rewards": [round(reward, 4) for reward in rewards], "success": success, "speed": speed}
+    written = [round(reward, 4) if math.isfinite(reward) else "NaN" for reward in rewards]  # of a task of the user's
+    header |= {"rewards": written, "success": success, "speed": speed}
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     page = PLAYER.read_text(encoding="utf-8").replace("%SCENE%", SCENE.read_text(encoding="utf-8"))
     page = page.replace("%TITLE%", escape(scene.task)).replace("%HEADER%", text)

@@ -59,7 +59,9 @@ export class Scene {
     const tenth = this.scale / 10, inside = canvas.height - surface > 24 * ratio;
     context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textAlign = "center";
-    for (let k = Math.floor(left * 10); k <= right * 10; k++) {
+    const first = Math.floor(left * 10), number = Math.floor(right * 10) - first;
+    for (let n = 0; n <= number; n++) {  // very far away, a number and the next one may be equal
+      const k = first + n;
       const column = Math.round(this.toPixel(k / 10, 0)[0]), next = Math.round(this.toPixel((k + 1) / 10, 0)[0]);
       context.fillStyle = this.colour("grid");
       if (!labels) {

@@ -219,6 +219,7 @@ VALUES = [
     ("path", lambda: film("film.avi")),
     ("size", lambda: film("film.mp4", size=3)),
     ("rate", lambda: film("film.gif", rate=0)),
+    ("rate", lambda: film("film.gif", rate=1e-3)),
     ("speed", lambda: film("film.gif", speed=-1)),
     ("zoom", lambda: film("film.gif", zoom=0)),
     ("pictures", lambda: film("film.png", pictures=0)),

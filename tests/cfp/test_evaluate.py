@@ -12,7 +12,8 @@ from fakes import FakeEnv
 from cfp import messages
 from cfp.errors import ConfigError
 from cfp.evaluate import Command
-from cfp.evaluation.returns import Trial, UntrainedPolicy, evaluate, explain, make_trial
+from cfp.evaluation.page import headline
+from cfp.evaluation.returns import Played, Result, Trial, UntrainedPolicy, evaluate, explain, make_trial
 from cfp.presets import preset
 from dittogym import Conditions
 
@@ -165,3 +166,11 @@ def test_the_seed_chooses_the_episodes():
 def test_the_table_claims_other_starts_only_where_starts_differ():
     claims = {task: "from starts" in explain(preset(task), [], True) for task in ("run", "grow", "obstacle")}
     assert claims == {"run": True, "grow": False, "obstacle": False}
+
+
+def test_the_headline_of_a_task_with_small_returns_tells_them_apart():
+    results = [
+        Result(name, 8, (Played(total, None, False, 1.0, 1.0),))
+        for name, total in (("zero action", -0.04), ("stage 1", 2.87))
+    ]
+    assert headline(preset("run"), results).endswith("return 2.9 (zero action 0.0)")

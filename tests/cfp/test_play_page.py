@@ -19,7 +19,7 @@ class Played:
     def __init__(self, browser: Any, width: int = 1280, task: str = "run", root_path: str = "") -> None:
         self.sessions: list[Session] = []
         self.server = Server(lambda: self._session(task), "secret", port=0, root_path=root_path)
-        self.thread = threading.Thread(target=self.server.run)
+        self.thread = threading.Thread(target=self.server.run, daemon=True)  # a test that fails may not close it
         self.thread.start()
         self.errors: list[str] = []
         self.page = browser.new_page(viewport={"width": width, "height": 800})
@@ -249,6 +249,11 @@ def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
     assert played.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert played.page.inner_text("#task") == "SHAPE MATCH" and played.page.title() == "SHAPE MATCH · dittogym"
     assert played.page.locator("#what option").count() == 2 and played.page.input_value("#speed") == "0.1"
+    for width in (1100, 900, 390):
+        played.page.set_viewport_size({"width": width, "height": 800})
+        places = [played.page.locator(name).bounding_box() for name in ("#numbers", "#legend")]
+        (numbers, legend) = ((box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]) for box in places)
+        assert legend[0] >= numbers[2] or legend[1] >= numbers[3], f"they overlap at {width} pixels"
     played.page.click("#draw")
     assert played.page.evaluate("scrollY") > 0
     played.draw((0.5, 0.5), (0.5, 0.5))

@@ -165,6 +165,16 @@ def test_pictures_of_a_film(recording: Recording) -> None:
     ]  # fmt: skip
 
 
+def test_a_caption_without_room_in_one_line_takes_two(recording: Recording) -> None:
+    def dark(*caption: str) -> np.ndarray:
+        return (recording.picture(0.0, size=200, caption=caption) < 100).any(-1)  # type: ignore[arg-type]
+
+    left, right = "shapematch   12.34 s", "return 123.4   20 times slower"
+    both, lines = dark(left, right), [dark(text, "")[:16] for text in (left, right)]
+    assert np.array_equal(both[:32], np.concatenate(lines))
+    assert np.array_equal(dark(left, "1.0")[:16, :130], lines[0][:, :130]) and not dark(left, "1.0")[16:32].any()
+
+
 def test_filmstrip(recording: Recording, tmp_path) -> None:
     strip = np.asarray(Image.open(recording.save(tmp_path / "strip.png", size=64, pictures=3, zoom=1)))
     assert strip.shape == (64, 3 * 64 + 2, 3) and (strip[:, 64] == 255).all()
@@ -279,5 +289,43 @@ def test_a_replay_plays_in_a_browser(recording: Recording, browser: Any, tmp_pat
     assert len(pictures) == 3 and f"20 steps of 10 ms, return {sum(recording.rewards):.1f}." in page.inner_text(
         "#about"
     )
+    before = page.evaluate("time.valueAsNumber")
+    page.focus("#time")
+    page.keyboard.press("ArrowRight")  # one step, of the slider, too
+    assert page.evaluate("time.valueAsNumber") == pytest.approx(before + 0.01)
     page.close()
     assert not errors
+
+
+def test_a_replay_shows_what_has_gone_wrong(recording: Recording, browser: Any, tmp_path) -> None:
+    """A robot that has flown away, and rewards that are not numbers; also long names, and steps of part of a ms."""
+    far = recording.shots[1]._replace(
+        x=recording.shots[1].x * np.float32(1e30), centre=np.full(2, 1e27), view=np.zeros(2)
+    )
+    wrong = replace(
+        recording,
+        scene=replace(recording.scene, dt=3e-4, task="a_task_with_such_a_long_name_that_it_takes_two_lines"),
+        shots=[recording.shots[0], far._replace(origin=np.full(2, 1e27))],
+        rewards=[np.nan],
+    )
+    page, errors = browser.new_page(viewport={"width": 600, "height": 800}), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(wrong.save(tmp_path / "replay.html", speed=1.0).as_uri())
+    page.wait_for_function("document.getElementById('play').textContent === 'Play' && document.body.dataset.ready")
+    assert page.inner_text("#return") == "return NaN" and page.inner_text("#about").startswith("1 step of 0.3 ms")
+    page.set_viewport_size({"width": 320, "height": 600})
+    assert page.evaluate("document.documentElement.scrollWidth") == 320
+    page.close()
+    assert not errors
+
+
+def test_a_return_that_is_rounded_to_zero_has_no_sign(recording: Recording, browser: Any, tmp_path) -> None:
+    shots, small = recording.shots[:2], (-0.01, 0.01)
+    films = [replace(recording, shots=shots, rewards=[reward]) for reward in small]
+    saved = [film.save(tmp_path / "film.gif", size=256, rate=2).read_bytes() for film in films]
+    assert saved[0] == saved[1]
+    page = browser.new_page()
+    page.goto(films[0].save(tmp_path / "replay.html", speed=1.0).as_uri())
+    page.wait_for_function("document.getElementById('play').textContent === 'Play' && document.body.dataset.ready")
+    assert page.inner_text("#return") == "return 0.0"
+    page.close()

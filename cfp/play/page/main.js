@@ -74,7 +74,7 @@ function show() {
     stats.latencies.push(performance.now() - presses.get(frame.echo));
     presses.clear();
   }
-  $("return").textContent = frame.total.toFixed(1);
+  $("return").textContent = frame.total.toFixed(1).replace(/^-0\.0$/, "0.0");
   $("step").textContent = frame.step;
   $("rate").textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : "paused";
   if (!toldSlow && frame.playing && frame.step > 100 && frame.rate < 0.7 * $("speed").value) {

@@ -53,9 +53,6 @@ export class Plot {
     context.fillRect(0, y(0), width, ratio);
     context.globalAlpha = 1;
     context.fillText(title, 0, top + 10 * ratio);
-    const most = high > -low ? high : low, label = most.toLocaleString(undefined, { maximumFractionDigits: Math.abs(most) < 100 ? 1 : 0 });
-    // Beside the end of the scale that it belongs to.
-    context.fillText(label, width - context.measureText(label).width, most < 0 ? top + height - 3 * ratio : top + 10 * ratio);
     series.forEach((values, k) => {
       context.beginPath();
       const step = Math.max(1, Math.floor(values.length / width));
@@ -64,6 +61,14 @@ export class Plot {
       context.lineWidth = 1.5 * ratio;
       context.stroke();
     });
+    const most = high > -low ? high : low, label = most.toLocaleString(undefined, { maximumFractionDigits: Math.abs(most) < 100 ? 1 : 0 });
+    // Beside the end of the scale that it belongs to.
+    const place = [width - context.measureText(label).width, most < 0 ? top + height - 3 * ratio : top + 10 * ratio];
+    context.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--card");
+    context.lineWidth = 3 * ratio;
+    context.strokeText(label, ...place);  // the curves end behind it
+    context.fillStyle = faint;
+    context.fillText(label, ...place);
   }
 }
 
