@@ -166,8 +166,8 @@ def test_pictures_of_a_film(recording: Recording) -> None:
 
 
 def test_a_caption_without_room_in_one_line_takes_two(recording: Recording) -> None:
-    def dark(*caption: str) -> np.ndarray:
-        return (recording.picture(0.0, size=200, caption=caption) < 100).any(-1)  # type: ignore[arg-type]
+    def dark(*caption: Any) -> np.ndarray:
+        return (recording.picture(0.0, size=200, caption=caption) < 100).any(-1)
 
     left, right = "shapematch   12.34 s", "return 123.4   20 times slower"
     both, lines = dark(left, right), [dark(text, "")[:16] for text in (left, right)]
