@@ -20,9 +20,10 @@ from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_
 from cfp.config import RunConfig, WindowConfig
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError, check_at_least
-from cfp.learner import NetworksPolicy, Resumable, Sees, UpdateLoop, linear_decay
+from cfp.learner import NetworksPolicy, Sees, UpdateLoop, linear_decay
 from cfp.policy import Memory, read_policy, report_mismatch, write_policy
 from cfp.presets import ON_SPEED, sac_preset
+from cfp.resumable import Resumable
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 

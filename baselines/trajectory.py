@@ -15,8 +15,9 @@ from cfp.config import EnvironmentConfig, Particles, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError, check_at_least, check_positive
 from cfp.experiment.folder import policy_path
-from cfp.learner import FINAL_FRACTION, Resumable, Scalars, Sees
+from cfp.learner import FINAL_FRACTION, Scalars, Sees
 from cfp.presets import sac_preset
+from cfp.resumable import Resumable
 from dittogym import TorchEnv, make_spec
 from dittogym.action import bicubic
 from dittogym.observation import soft_silhouette

@@ -31,19 +31,11 @@ from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import policy_path
 from cfp.experiment.run import TrainingRun
 from cfp.hub import is_address
-from cfp.learner import (
-    CoarseToFine,
-    NetworksPolicy,
-    Resumable,
-    UpdateLoop,
-    compress,
-    copy_coarse_weights,
-    decompress,
-    linear_decay,
-)
+from cfp.learner import CoarseToFine, NetworksPolicy, UpdateLoop, copy_coarse_weights, linear_decay
 from cfp.messages import say
 from cfp.policy import copy_policy, load, read_policy, shipped
 from cfp.presets import sac_preset
+from cfp.resumable import Resumable, compress, decompress
 from dittogym import TorchEnv, make_spec
 from dittogym.conditions import drop
 from dittogym.spec import DT

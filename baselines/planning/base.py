@@ -12,7 +12,7 @@ from torch import Tensor
 from baselines.common.rollout import StepFunction, check_differentiable, rollout, soft_step
 from cfp.analytic.window import split_cost
 from cfp.errors import ConfigError, check_at_least
-from cfp.learner import Resumable
+from cfp.resumable import Resumable
 from dittogym import TorchEnv
 from dittogym.core import EnvState, Model, StepResult
 from dittogym.rewards import features_of

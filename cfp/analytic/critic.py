@@ -14,7 +14,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from cfp.analytic.window import Window, discount_rate, td_lambda_targets
 from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
-from cfp.learner import Resumable
+from cfp.resumable import Resumable
 from dittogym import TorchEnv
 from dittogym.copies import constant
 from dittogym.geometry import centre_in_window

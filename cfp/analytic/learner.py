@@ -20,18 +20,9 @@ from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import (
-    AveragedWeights,
-    CoarseToFine,
-    NetworksPolicy,
-    Resumable,
-    UpdateLoop,
-    compress,
-    decompress,
-    linear_decay,
-    refines,
-)
+from cfp.learner import AveragedWeights, CoarseToFine, NetworksPolicy, UpdateLoop, linear_decay, refines
 from cfp.presets import analytic_preset
+from cfp.resumable import Resumable, compress, decompress
 
 #: Every scalar that ``CFPAnalytic.update`` logs, and what it means.
 METRICS: dict[str, str] = {

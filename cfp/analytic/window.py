@@ -18,7 +18,7 @@ from cfp.config import EVALUATION_SEED, WindowConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import DIVERGED, TorchVecEnv, first_limits
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.learner import Resumable
+from cfp.resumable import Resumable
 from dittogym import TorchEnv, core
 from dittogym.copies import to_host
 from dittogym.pieces import largest_piece

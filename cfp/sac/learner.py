@@ -35,8 +35,9 @@ from cfp.envs.make import choose_device, make_env
 from cfp.envs.vec_env import TorchVecEnv, keeps_tensors
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import AveragedWeights, CoarseToFine, Learner, generator_state, refines, restore_generator
+from cfp.learner import AveragedWeights, CoarseToFine, Learner, refines
 from cfp.presets import sac_preset
+from cfp.resumable import generator_state, restore_generator
 from cfp.sac.policies import CFPPolicy, TwinCritic, TwinCriticPolicy
 from cfp.sac.replay import Composition, ReplayRing
 from dittogym.copies import to_device

@@ -25,8 +25,8 @@ from cfp.config import Hyperparameters, WindowConfig, to_words
 from cfp.envs.vec_env import TorchVecEnv, monitored
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.checkpoint import ReplayArchive
-from cfp.learner import generator_state, restore_generator
 from cfp.presets import GPU, analytic_preset, for_gpu, sac_preset
+from cfp.resumable import generator_state, restore_generator
 from cfp.sac import learner, replay
 from cfp.tables import read_table
 
