@@ -23,14 +23,9 @@ class VideoUnavailable(ImportError):
     """The optional packages that write MP4 files are not installed, or their ffmpeg fails."""
 
 
-def available() -> bool:
-    """Whether the optional packages that write MP4 files are installed."""
-    return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
-
-
 def check_available() -> None:
-    """Raise `VideoUnavailable` unless MP4 files can be written."""
-    if not available():
+    """Raise `VideoUnavailable` unless the optional packages that write MP4 files are installed."""
+    if not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
         raise VideoUnavailable("MP4 needs imageio with ffmpeg: pip install 'torchmpm[video]'")
 
 
