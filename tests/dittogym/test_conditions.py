@@ -12,29 +12,13 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, tiny
+from tiny import ALL, FIXED, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, tiny
 
 import dittogym
 from dittogym import Conditions, TorchEnv
 from dittogym import conditions as drawing
 from dittogym.action import bicubic
 from torchmpm import tree
-
-#: Every condition, with ranges for which each task has room.
-ALL = Conditions(
-    latency=(0, 2),
-    action_noise=(0.0, 0.3),
-    action_dropout=(0.0, 0.5),
-    observation_dropout=(0.0, 0.5),
-    mu=(0.8, 1.2),
-    yield_stress=(0.5, 1.5),
-    gravity=(0.9, 1.1),
-    shift=0.01,
-    turn=5.0,
-    velocity=0.5,
-    chance=0.7,
-    grid=4,
-)
 
 
 def varied(task: str = "run", num_envs: int = 1, **ranges: Any) -> TorchEnv:
@@ -294,24 +278,6 @@ def test_starts_that_are_not_moved_keep_every_bit() -> None:
     found = env.env_state.conditions
     rests = (found["shift"] == 0).all(1) & (found["turn"] == 0)
     assert rests.any() and torch.equal((env.state.x == plain.state.x).all(2).all(1), rests)
-
-
-@pytest.mark.parametrize("task", TASKS)
-@torch.no_grad()
-def test_an_element_has_its_episode_in_any_batch(task: str) -> None:
-    batch, singles = tiny(task, 3, conditions=ALL), [tiny(task, conditions=ALL) for _ in range(3)]
-    seen = batch.reset(seed=5)[0]
-    for i, env in enumerate(singles):
-        assert torch.equal(env.reset(seed=5 + i)[0][0], seen[i])
-    for t, action in enumerate(actions(batch, 4)):
-        if t == 2:  # without a seed: the next episodes
-            batch.reset(options={"reset_mask": [False, True, False]}), singles[1].reset()
-        result = batch.step(action)
-        for i, env in enumerate(singles):
-            single = env.step(action[i : i + 1])
-            assert torch.equal(single[0][0], result[0][i])
-            for ours, theirs in zip(everything(batch), everything(env), strict=True):
-                assert (ours[i] - theirs[0]).abs().max() <= 1e-9 * max(1.0, theirs.abs().max())
 
 
 # Resets, states and snapshots.

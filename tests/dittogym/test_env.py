@@ -78,14 +78,20 @@ def test_same_step_autoreset() -> None:
     assert_reset(last[4], start)
 
 
-def test_final_infos_hold_what_ended_alone() -> None:
-    """As Gymnasium's own do, in which a mean over elements that go on would count them as well."""
+def test_a_failed_element_starts_anew() -> None:
+    """Final infos hold it alone: as in Gymnasium's own, a mean over the others would count them as well."""
     vector = make_vec("grow", 3, autoreset_mode="SameStep")
     vector.reset(seed=0)
     vector.unwrapped.state.v[1] = torch.nan
-    final = vector.step(np.zeros(vector.action_space.shape, np.float32))[4]["final_info"]
-    assert final["_reward_terms/alive"].tolist() == [False, True, False]
+    still = np.zeros(vector.action_space.shape, np.float32)
+    _, rewards, terminated, _, info = vector.step(still)
+    assert terminated.tolist() == [False, True, False] and rewards[1] == -16.0
+    final = info["final_info"]
+    assert final["_reward_terms/alive"].tolist() == final["_finite"].tolist() == [False, True, False]
     assert final["reward_terms/failure"].tolist() == [0.0, -16.0, 0.0] and not final["com"][[0, 2]].any()
+    assert not final["finite"].any() and info["finite"].all()
+    _, _, terminated, _, info = vector.step(still)
+    assert info["finite"].all() and not terminated.any()
 
 
 def test_next_step_autoreset() -> None:
