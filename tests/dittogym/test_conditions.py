@@ -14,7 +14,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from tiny import ALL, FIXED, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, tiny
 
-import dittogym
 from dittogym import Conditions, TorchEnv
 from dittogym import conditions as drawing
 from dittogym.action import bicubic
@@ -441,43 +440,6 @@ def test_gradients_after_a_reset_in_inference_mode() -> None:
     assert results[0].abs().max() > 0 and torch.equal(*results)
 
 
-# Arguments.
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"latency": 0.5}, "latency must be a whole number, got 0.5"),
-        ({"latency": (-1, 2)}, "latency must not be negative, got -1"),
-        ({"latency": (2, 1)}, r"latency must be a pair \(lowest, highest\), got \(2, 1\)"),
-        ({"action_noise": -0.1}, "action_noise must not be negative"),
-        ({"action_noise": math.nan}, "action_noise must be finite"),
-        ({"action_dropout": (0.5, 1.5)}, "action_dropout must be at most 1, got 1.5"),
-        ({"observation_dropout": (0, 0.1, 0.2)}, r"observation_dropout must be a number or a pair"),
-        ({"mu": 0.0}, "mu must be positive, got 0.0"),
-        ({"yield_stress": "1"}, "yield_stress must be a number, got '1'"),
-        ({"shift": (0.0, 0.1)}, r"shift must be a number, got \(0.0, 0.1\)"),
-        ({"chance": 1.1}, "chance must be at most 1, got 1.1"),
-        ({"grid": 0}, "grid must be at least 1, got 0"),
-        ({"friction": 1.0}, "conditions may hold latency, .*, got 'friction'"),
-        (0.5, "conditions must be dittogym.Conditions or a mapping, got float"),
-        ({"grid": 9}, "conditions must have a grid of at most 8, as actions have, got 9"),
-        ({"mu": (1.0, 500.0)}, "conditions must leave the matter stable, got .*500.*dt must be at most"),
-        ({"gravity": 1e6}, "conditions must leave the matter stable"),
-        ({"shift": 0.2}, "conditions must leave the robot room, got shift=0.2 and turn=0, .* 'side walls'"),
-        ({"turn": 45.0}, "conditions must leave the robot room, got shift=0 and turn=45, .* 'right beam'"),
-    ],
-)
-def test_what_cannot_be_is_refused_when_an_environment_is_made(given: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        tiny("grow", conditions=given)
-
-
-def test_no_start_is_at_the_place_of_the_object() -> None:
-    with pytest.raises(ValueError, match=r"conditions must leave the robot room.*place of the object"):
-        tiny("kick", conditions={"shift": 0.15})
-
-
 # Behind Gymnasium.
 
 
@@ -497,17 +459,3 @@ def test_through_gymnasium(task: str) -> None:
     images = vector.reset(seed=7)[0]
     for i in range(2):
         assert np.array_equal(made[0].reset(seed=7 + i)[0], images[i])
-
-
-def test_the_environments_of_the_ids_have_none() -> None:
-    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
-    env.reset(seed=0)
-    assert env.unwrapped.torch_env.conditions is None and env.unwrapped.torch_env.env_state.conditions == {}
-
-
-def test_a_task_of_ones_own_keeps_another_name_for_its_option() -> None:
-    def windy(conditions: str = "calm") -> dittogym.TaskSpec:
-        return dittogym.make_spec("run")
-
-    with pytest.raises(ValueError, match="conditions"):
-        dittogym.register("windy", windy)

@@ -182,16 +182,6 @@ def test_a_failed_element_leaves_shared_gradients_alone(task: str, backend: str)
         assert alone.abs().max() > 0
 
 
-def test_detach_cuts_the_graph() -> None:
-    env = small()
-    env.reset(seed=0)
-    first, second = (torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    env.step(first)
-    env.detach()
-    env.step(second)[1].sum().backward()
-    assert first.grad is None and second.grad is not None
-
-
 @pytest.mark.parametrize("use_reentrant", [True, False])
 def test_a_step_is_not_repeated_by_a_checkpoint(use_reentrant: bool) -> None:
     """It would begin in the state after the step, and the gradients would be wrong."""

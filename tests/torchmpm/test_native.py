@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from native_scenes import NAMES, moving, solvers
-from scenes import assert_close, assert_identical, lively, normal, robot
+from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
@@ -41,16 +41,12 @@ def test_equals_eager(name: str, batch: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_single_precision(name: str) -> None:
-    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
     state, field, origin = moving(COUNT, 2)
     solver = solvers(COUNT, 2)[name]
     exact = replace(solver, backend="eager").step(state, field, substeps=20, origin=origin)
     native, eager = both(solver, state.to(torch.float32), field.float(), substeps=20, origin=origin.float())
     assert native.dtype == torch.float32
-    for field_name in ("x", "v", "C", "F", "Jp"):
-        true = getattr(exact, field_name)
-        mine, plain = ((getattr(s, field_name).double() - true).norm() for s in (native, eager))
-        assert mine <= 3.0 * plain + 1e-6 * true.norm(), field_name
+    assert_as_precise(native, eager, exact)
 
 
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (2, 1), (1, 63), (1, 64), (3, 65), (1, 2500), (2, 9000)])
