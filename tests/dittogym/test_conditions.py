@@ -313,21 +313,6 @@ def test_environments_that_are_never_seeded_differ() -> None:
     assert len(seeds.unique()) == 4
 
 
-@torch.no_grad()
-def test_a_reset_that_raises_changes_nothing() -> None:
-    env = tiny("run", 2, conditions={**vars(ALL), "mu": 4.0})
-    env.reset(seed=0)
-    env.step(actions(env, 1)[0])
-    before = tree.map(torch.Tensor.clone, env.env_state)
-    for options in ({"physics": {"mu": 4e4}}, {"physics": {"mu": -1.0}}, {"positions": torch.zeros(3, 2)}):
-        with pytest.raises(ValueError, match=r"mu|positions"):
-            env.reset(seed=1, options=options)
-    assert_same_bits(everything(env), tree.leaves(before))
-    twin = tiny("run", 2, conditions=env.conditions)
-    twin.reset(seed=0), twin.reset(), env.reset()
-    assert_same_bits(everything(env), everything(twin))
-
-
 @pytest.mark.parametrize("task", TASKS)
 @torch.no_grad()
 def test_a_loaded_moment_goes_on_with_its_conditions(task: str, tmp_path: Any) -> None:
@@ -425,19 +410,6 @@ def test_detached_states_hold_no_graph() -> None:
     assert env.env_state.conditions["pending"].requires_grad
     env.detach()
     assert not any(leaf.requires_grad for leaf in everything(env))
-
-
-def test_gradients_after_a_reset_in_inference_mode() -> None:
-    results = []
-    for inference in (False, True):
-        env = tiny("run", 2, conditions=ALL)
-        with torch.inference_mode(inference), torch.no_grad():
-            env.reset(seed=0)
-            env.step(actions(env, 1)[0])
-        drive = actions(env, 3, seed=1).requires_grad_()
-        sum(env.step(action, soft=True)[1].sum() for action in drive).backward()
-        results.append(drive.grad)
-    assert results[0].abs().max() > 0 and torch.equal(*results)
 
 
 # Behind Gymnasium.

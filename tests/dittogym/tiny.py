@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import dittogym
-from torchmpm import ParticleState, tree
+from torchmpm import tree
 
 TASKS = tuple(dittogym.TASKS)
 #: Tasks whose window stays where it is.
@@ -75,8 +75,7 @@ def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
 
 def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:
     """Put other values in place of fields of the particles."""
-    own = {name: fields.get(name, getattr(env.state, name)) for name in ("x", "v", "C", "F", "Jp")}
-    env.env_state = replace(env.env_state, particles=ParticleState(**own))
+    env.env_state = replace(env.env_state, particles=replace(env.state, **fields))
 
 
 def forget(function: Callable[..., Any]) -> None:
