@@ -103,15 +103,7 @@ class Model:
 def make_model(
     spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, segment: Segment = "auto", dt: float = DT
 ) -> Model:
-    """Build the physics of a task.
-
-    Args:
-        spec: The task.
-        counts: Particles of each body.
-        substeps: Substeps of a control step.
-        backend: Of the solver.
-        segment: See :class:`Model`.
-        dt: Duration of a substep, s.
+    """Build the physics of a task with ``counts`` particles of each body; other arguments are those of a `TorchEnv`.
 
     Raises:
         ValueError: The matter, its muscles or gravity need shorter substeps.

@@ -122,14 +122,10 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
 def bodies_of(
     spec: TaskSpec, counts: tuple[int, ...], particle_weight: tuple[float, ...], physics: Physics
 ) -> tuple[Body, ...]:
-    """Robot and objects as the solver has them.
+    """Robot and objects as the solver has them, with ``physics`` in place of the task's own constants.
 
-    Args:
-        spec: The task.
-        counts: Particles of each body.
-        particle_weight: By body, the full-size particles that one particle stands for: a factor on mass and volume, so
-            that density and stiffness mean the same for every particle count.
-        physics: Constants in place of the task's own.
+    The full-size particles that a particle of each body stands for are a factor on its mass and volume, so that density
+    and stiffness mean the same for every particle count.
     """
     values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
     bodies: list[Body] = []

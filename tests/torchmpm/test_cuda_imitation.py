@@ -12,9 +12,10 @@ from dataclasses import replace
 import pytest
 import torch
 from cuda_imitation import Broken, Gpu, Imitation, Plan, Threads
-from native_scenes import NAMES, moving, solvers
+from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
+    assert_broken_alone,
     assert_gradients_close,
     compare_gradients,
     gradients,
@@ -172,16 +173,10 @@ def test_without_muscles(use: Callable[..., None]) -> None:
 
 @pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float, use: Callable[..., None]) -> None:
-    """Above and below the window, and at no place, particles keep what they have."""
-    state = lively(10)
-    x = state.x.clone()
-    x[:, 3, 1] = y
     for plan in (Plan(window=(16, 14), muscles=False), Plan(shared=False, team=2, muscles=False)):
         use(plan)
-        native, eager = (step(robot(10, rules=()), b, replace(state, x=x), substeps=2) for b in ("native", "eager"))
-        others = [k for k in range(10) if k != 3]
-        torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
-        assert torch.equal(native.v[:, 3], state.v[:, 3])
+        native, eager = (step(robot(10, rules=()), b, lost(10, y), substeps=2) for b in ("native", "eager"))
+        assert_lost_alone(native, eager, lost(10, y), 1e-13)
 
 
 @pytest.mark.parametrize("corner", [(0.0, -0.1), (0.75, 0.8), (-0.2, 0.4)])
@@ -199,19 +194,8 @@ def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None
 def test_a_broken_robot_harms_no_other(name: str, value: float, dtype: torch.dtype, use: Callable[..., None]) -> None:
     given = {key: t.to(dtype) for key, t in state_leaves(15, 3).items()}
     given[name][1].view(-1)[::5] = value
-    ends = []
-    for chosen in ([0, 1, 2], [0, 2]):
-        use(Plan(team=2, teams=1))
-        leaves = {key: t[chosen].requires_grad_() for key, t in given.items()}
-        state = ParticleState(*(leaves[n] for n in ("x", "v", "C", "F", "Jp")))
-        solver = solvers(15, 1)["three bodies"]
-        final = step(solver, "native", state, leaves["actuation"], substeps=3, origin=leaves["origin"])
-        loss = final.x[[0, -1]].sum() + final.F[[0, -1]].square().sum()
-        ends.append((final.detach()[[0, -1]], torch.autograd.grad(loss, list(leaves.values()))))
-    (together, of_all), (apart, of_some) = ends
-    assert_identical(together, apart)
-    for one, other in zip(of_all, of_some, strict=True):
-        torch.testing.assert_close(one[[0, 2]], other, rtol=0, atol=1e-5 * other.abs().max().item())
+    use(Plan(team=2, teams=1))
+    assert_broken_alone(replace(solvers(15, 1)["three bodies"], backend="native"), given, 1e-5)
 
 
 def test_not_a_number_spreads_as_on_the_cpu(use: Callable[..., None]) -> None:

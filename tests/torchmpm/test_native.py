@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from native_scenes import NAMES, moving, solvers
+from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -106,15 +106,7 @@ def test_a_constant_is_the_same_in_every_form(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("y", [math.nan, math.inf, -math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float) -> None:
-    """Above and below the window, and at no place, particles keep what they have."""
-    state = lively(20)
-    x = state.x.clone()
-    x[:, 3, 1] = y
-    native, eager = both(robot(20, rules=()), replace(state, x=x), substeps=3)
-    others = [k for k in range(20) if k != 3]
-    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
-    for result in (native, eager):
-        assert torch.equal(result.v[:, 3], state.v[:, 3])
+    assert_lost_alone(*both(robot(20, rules=()), lost(20, y), substeps=3), lost(20, y), 1e-13)
 
 
 def test_what_the_kernels_do_not_support_is_named() -> None:

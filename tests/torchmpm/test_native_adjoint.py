@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import combination, lively, normal, robot
+from scenes import assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -101,6 +101,20 @@ def compare_gradients(
     assert all(value.isfinite().all() for value in found.values())
     assert_gradients_close(found, expected, tolerance)
     return expected
+
+
+def assert_broken_alone(solver: Solver, given: Leaves, tolerance: float) -> None:
+    """The second of three robots harms no other: with and without it they have the same states and derivatives."""
+    ends = []
+    for chosen in ([0, 1, 2], [0, 2]):
+        leaves = {name: value[chosen].requires_grad_() for name, value in given.items()}
+        start = ParticleState(*(leaves[name] for name in STATE))
+        final = solver.step(start, leaves["actuation"], substeps=3, origin=leaves["origin"])[[0, -1]]
+        found = torch.autograd.grad(final.x.sum() + final.F.square().sum(), list(leaves.values()))
+        ends.append((final.detach(), {name: value[[0, -1]] for name, value in zip(leaves, found, strict=True)}))
+    (together, of_all), (apart, of_some) = ends
+    assert_identical(together, apart)
+    assert_gradients_close(of_all, of_some, tolerance)
 
 
 @pytest.mark.parametrize("substeps", [1, 25])
