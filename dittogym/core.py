@@ -103,7 +103,9 @@ class Model:
 def make_model(
     spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, segment: Segment = "auto", dt: float = DT
 ) -> Model:
-    """Build the physics of a task with ``counts`` particles of each body; other arguments are those of a `TorchEnv`.
+    """Build the physics of a task with ``counts`` particles of each body.
+
+    The other arguments are as in :class:`dittogym.TorchEnv`.
 
     Raises:
         ValueError: The matter, its muscles or gravity need shorter substeps.

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.copies import to_device, to_host
+from dittogym.copies import to_device
 from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, spaces, step_to_host
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
@@ -46,7 +46,7 @@ def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | np.ndarr
     done, finals, reset_info = terminated | truncated, {}, {}
     if done.any():
         ended = np.flatnonzero(done)
-        images = to_host({"": observation[to_device(ended, observation.device)]})[""]
+        images = as_numpy(observation[to_device(ended, observation.device)])
         finals = dict(zip(ended.tolist(), images, strict=True))
         observation, reset_info = env.reset(options={"reset_mask": torch.from_numpy(done)})
     return AutoresetStep(observation, reward, terminated, truncated, done, info, finals, reset_info)

@@ -39,7 +39,7 @@ def frame(
     caption: tuple[str, str] | None = None,
     legend: bool = False,
 ) -> np.ndarray:
-    """Draw one moment, (size, size, 3) uint8 RGB; the options are those of `Recording.picture`."""
+    """Draw one moment, (size, size, 3) uint8 RGB; options as in :meth:`dittogym.render.recording.Recording.picture`."""
     width = check_view(size, zoom)
     checks.flag("muscles", muscles)
     canvas = Canvas(size, shot.corner(width), width)
