@@ -361,8 +361,8 @@ def tables(camera: Camera, device: torch.device) -> dict[str, Tensor]:
     """Of each body, particles, full-size particles that one stands for, and whether its velocity is hidden; boxes."""
     bodies = list(zip(camera.counts, camera.particle_weight, camera.hidden_velocity, strict=True))
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
-    tables = {"body": bodies, "box": edges}
-    return {name: torch.tensor(rows, dtype=torch.float64, device=device) for name, rows in tables.items()}
+    named = {"body": bodies, "box": edges}
+    return {name: torch.tensor(rows, dtype=torch.float64, device=device) for name, rows in named.items()}
 
 
 def arrays_of(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> dict[str, Tensor]:

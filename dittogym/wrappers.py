@@ -81,7 +81,10 @@ class _VectorObservation(VectorWrapper):
 
 
 def _spaces(env: AnyEnv, name: str, size: int) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """The space of a single environment's images, and that of resized ones with its range, which others may change."""
+    """The space of a single environment's images, and that of resized ones.
+
+    Both have the same range, which another wrapper may have changed.
+    """
     box = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name, None)
     if not isinstance(box, gymnasium.spaces.Box):
         kind = type(env).__name__
