@@ -313,36 +313,6 @@ def test_environments_that_are_never_seeded_differ() -> None:
     assert len(seeds.unique()) == 4
 
 
-@pytest.mark.parametrize("task", TASKS)
-@torch.no_grad()
-def test_a_loaded_moment_goes_on_with_its_conditions(task: str, tmp_path: Any) -> None:
-    """With the actions that are pending, in other environments, through a file, and in some elements alone."""
-    conditions = {**vars(ALL), "latency": 2}
-    env = tiny(task, 2, conditions=conditions)
-    env.reset(seed=4)
-    drive = actions(env, 5)
-    for action in drive[:2]:
-        seen = env.step(action)[0]
-    torch.save(env.save(), tmp_path / "moment.pt")
-    moment = torch.load(tmp_path / "moment.pt", weights_only=True)
-    future = [(env.step(action), everything(env)) for action in drive[2:]]
-    env.reset()
-    future += [everything(env)]
-    other = tiny(task, 2, conditions=conditions)
-    other.reset(seed=4)
-    assert torch.equal(other.load(moment), seen)
-    again = [(other.step(action), everything(other)) for action in drive[2:]]
-    other.reset()
-    assert_same_bits([*again, everything(other)], future)
-    third = tiny(task, 2, conditions=conditions)
-    third.reset(seed=30)
-    third.load(moment, [False, True])
-    kept, loaded = conditions_of(third), moment.state.conditions
-    for name, value in kept.items():
-        assert torch.equal(value[1], loaded[name][1])
-    assert kept["seed"][0] == 30
-
-
 @torch.no_grad()
 def test_states_of_environments_with_and_without_conditions() -> None:
     """Without, conditions are left behind; with, they are needed, and must be of the same kind."""
