@@ -20,7 +20,7 @@ from torch import Tensor
 from dittogym.action import bicubic
 from dittogym.bodies.positions import check_robot_at, probe
 from dittogym.copies import to_device
-from dittogym.physics import Physics, default, has_effect
+from dittogym.physics import Physics, has_effect, value_of
 from dittogym.spec import TaskSpec
 from torchmpm import checks
 
@@ -238,8 +238,7 @@ def physics_of(conditions: Conditions, drawn: Drawn, spec: TaskSpec, physics: Ph
     """Constants of the matter with the factors of the episodes, for B simulations, B the length of ``like``."""
     changed = {}
     for name in conditions.changes(spec):
-        value = physics[name] if name in physics else default(spec, name, like)
-        factor = drawn[name]
+        value, factor = value_of(name, physics, spec, like), drawn[name]
         changed[name] = value * (factor if value.ndim == 1 else factor[:, None])
     return {**physics, **changed}
 

@@ -103,15 +103,9 @@ class Model:
 def make_model(
     spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, segment: Segment = "auto", dt: float = DT
 ) -> Model:
-    """Build the physics of a task.
+    """Build the physics of a task with ``counts`` particles of each body.
 
-    Args:
-        spec: The task.
-        counts: Particles of each body.
-        substeps: Substeps of a control step.
-        backend: Of the solver.
-        segment: See :class:`Model`.
-        dt: Duration of a substep, s.
+    The other arguments are as in :class:`dittogym.TorchEnv`.
 
     Raises:
         ValueError: The matter, its muscles or gravity need shorter substeps.

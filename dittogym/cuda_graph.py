@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,30 +23,14 @@ WARM_UP = 2
 _logger = logging.getLogger(__name__)
 
 
-class Graph(Protocol):
-    """A recording of launches on a device."""
-
-    def record(self, function: Callable[[], Result]) -> Result:
-        """Record what a function launches; its result holds numbers only after a replay."""
-
-    def replay(self) -> None:
-        """Launch it again on the current stream."""
-
-    def wait(self) -> None:
-        """Let the current stream wait until the buffers are free."""
-
-    def free(self) -> None:
-        """Say that they are free once the current stream has come this far."""
-
-
 class CudaGraph:
-    """:class:`Graph` of torch."""
+    """A recording of launches on a device."""
 
     def __init__(self, device: torch.device) -> None:
         self._device, self._graph, self._freed = device, torch.cuda.CUDAGraph(), torch.cuda.Event()
 
     def record(self, function: Callable[[], Result]) -> Result:
-        """See :class:`Graph`."""
+        """Record what a function launches; its result holds numbers only after a replay."""
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream()
             try:
@@ -57,16 +41,16 @@ class CudaGraph:
                 torch.cuda.set_stream(stream)  # torch stays on its own where the recording fails
 
     def replay(self) -> None:
-        """See :class:`Graph`."""
+        """Launch it again on the current stream."""
         with torch.cuda.device(self._device):
             self._graph.replay()
 
     def wait(self) -> None:
-        """See :class:`Graph`."""
+        """Let the current stream wait until the buffers are free."""
         torch.cuda.current_stream(self._device).wait_event(self._freed)
 
     def free(self) -> None:
-        """See :class:`Graph`."""
+        """Say that they are free once the current stream has come this far."""
         self._freed.record(torch.cuda.current_stream(self._device))
 
 
@@ -78,10 +62,10 @@ class Replayed:
 
     Args:
         function: Takes and returns trees of tensors (see :mod:`torchmpm.tree`); all else in them must stay equal.
-        graph: Makes a :class:`Graph` on a device.
+        graph: Makes a recording on a device, as :class:`CudaGraph` does.
     """
 
-    def __init__(self, function: Callable[..., Any], graph: Callable[[torch.device], Graph] = CudaGraph) -> None:
+    def __init__(self, function: Callable[..., Any], graph: Callable[[torch.device], Any] = CudaGraph) -> None:
         self.function, self.graph = function, graph
         self.failure: str | None = None
         self._seen = 0
@@ -126,18 +110,14 @@ class Replayed:
 class Recording:
     """A function on buffers of its own, as :class:`Replayed` uses it.
 
-    Args:
-        function: As there.
-        graph: As there.
-        entries: Arguments, flat.
-        structure: Their structure.
-        constants: Tensors whose memory the launches read, besides the arguments.
+    The arguments are given as flat ``entries`` and their ``structure``; ``constants`` are tensors whose memory the
+    launches read besides them.
     """
 
     def __init__(
         self,
         function: Callable[..., Any],
-        graph: Callable[[torch.device], Graph],
+        graph: Callable[[torch.device], Any],
         entries: Sequence[Any],
         structure: pytree.TreeSpec,
         constants: Sequence[Tensor],

@@ -7,8 +7,9 @@ import functools
 import hashlib
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -35,8 +36,12 @@ class Arguments(ctypes.Structure):
     ]
 
 
-class Kernel(NamedTuple):
+@dataclass(frozen=True)
+class Kernel:
     """What the kernel is compiled for, as :class:`torchmpm.native.cuda.arguments.Kernel` says it of those there."""
+
+    source: ClassVar[str] = str(_SOURCE)
+    name: ClassVar[str] = "dittogym_draw"
 
     real: str  # "float" or "double"
     threads: int
@@ -46,16 +51,6 @@ class Kernel(NamedTuple):
     def of(cls, dtype: torch.dtype) -> Kernel:
         """That for positions in a dtype."""
         return cls({torch.float32: "float", torch.float64: "double"}[dtype], THREADS, _digest())
-
-    @property
-    def source(self) -> str:
-        """Its file."""
-        return str(_SOURCE)
-
-    @property
-    def name(self) -> str:
-        """Its name in the compiled module."""
-        return "dittogym_draw"
 
     @property
     def macros(self) -> dict[str, str]:

@@ -73,6 +73,18 @@ def first(value: Any) -> Any:
     return bool(value[0]) if isinstance(value[0], np.bool_) else value[0]
 
 
+def step_to_host(env: TorchEnv, action: torch.Tensor) -> tuple[torch.Tensor, list[np.ndarray], dict[str, np.ndarray]]:
+    """A step of a batch, of which all but the observations is copied in one piece, so that a GPU is waited for once.
+
+    Returns:
+        The observations, still a tensor; rewards, terminated, truncated and steps taken, (B,) each; and ``info``.
+    """
+    observation, reward, terminated, truncated, info = env.step(action)
+    own = {"_reward": reward, "_terminated": terminated, "_truncated": truncated, "_steps": env.env_state.steps}
+    arrays = to_host(flat(info) | own)
+    return observation, [arrays.pop(name) for name in own], arrays
+
+
 class Shell:
     """What both Gymnasium environments have around their :class:`dittogym.TorchEnv`."""
 
@@ -186,14 +198,12 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
-            image, *own, raw = self.torch_env.step(batch)
-        names = ("_reward", "_terminated", "_truncated")
-        info = first(to_host(flat(raw) | dict(zip(names, own, strict=True))))  # a GPU is waited for once
-        reward, terminated, truncated = float(info.pop(names[0])), bool(info.pop(names[1])), bool(info.pop(names[2]))
+            image, own, info = step_to_host(self.torch_env, batch)
+        reward, terminated, truncated, _ = (array[0].item() for array in own)
         self._return += reward
         self._show()
         limit = truncated and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
-        return first(as_numpy(image)), reward, terminated, limit, info
+        return first(as_numpy(image)), reward, terminated, limit, first(info)
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`; returns its observation (3, 64, 64) uint8.

@@ -357,12 +357,19 @@ def _drawing(camera: Camera, dtype: torch.dtype, device: torch.device) -> Drawin
         return str(error)
 
 
-def tables(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+def tables(camera: Camera, device: torch.device) -> dict[str, Tensor]:
     """Of each body, particles, full-size particles that one stands for, and whether its velocity is hidden; boxes."""
     bodies = list(zip(camera.counts, camera.particle_weight, camera.hidden_velocity, strict=True))
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
-    body, box = (torch.tensor(rows, dtype=torch.float64, device=device) for rows in (bodies, edges))
-    return body, box
+    named = {"body": bodies, "box": edges}
+    return {name: torch.tensor(rows, dtype=torch.float64, device=device) for name, rows in named.items()}
+
+
+def arrays_of(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> dict[str, Tensor]:
+    """Contiguous arrays of particles by component and of windows, and one for the image."""
+    arrays = {"x": x.movedim(-1, 0), "v": v.movedim(-1, 0), "origin": origin, "centre": centre}
+    image = torch.empty(len(x), *SHAPE, dtype=torch.uint8, device=x.device)
+    return {name: array.contiguous() for name, array in arrays.items()} | {"image": image}
 
 
 def numbers(camera: Camera) -> dict[str, Any]:
@@ -383,19 +390,17 @@ def native_drawing(camera: Camera, dtype: torch.dtype) -> Drawing:
     """A function that draws what a camera sees as one C++ call, for tensors on the CPU."""
     kind = {torch.float32: "float", torch.float64: "double"}[dtype]
     function = getattr(build(_SOURCE, "-ffp-contract=off"), f"dittogym_draw_{kind}")
-    (body, box), constants = tables(camera, torch.device("cpu")), numbers(camera)
+    fixed, constants = tables(camera, torch.device("cpu")), numbers(camera)
 
-    def draw(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
-        x, v = (t.movedim(-1, 0).contiguous() for t in (x, v))
-        origin, centre = origin.contiguous(), centre.contiguous()
-        image = torch.empty(x.shape[1], *SHAPE, dtype=torch.uint8, device="cpu")
-        arrays = {"body": body, "box": box, "x": x, "v": v, "origin": origin, "centre": centre, "image": image}
+    def draw(*given: Tensor) -> Tensor:
+        arrays = arrays_of(*given) | fixed
         pointers = {name: array.data_ptr() for name, array in arrays.items()}
-        sizes = {"batch": x.shape[1], "particles": x.shape[2], "threads": torch.get_num_threads()}
+        _, batch, particles = arrays["x"].shape
+        sizes = {"batch": batch, "particles": particles, "threads": torch.get_num_threads()}
         call = Picture(**sizes, **pointers, **constants, **thread_pool())
         if function(ctypes.byref(call)):
             raise MemoryError("there is not enough memory to draw the observation")
-        return image
+        return arrays["image"]
 
     return draw
 
@@ -408,17 +413,14 @@ def cuda_drawing(camera: Camera, dtype: torch.dtype, device: torch.device, drive
     """
     if device.type == "cuda" and (reason := unavailable(device)) is not None:
         raise ValueError(reason)
-    (body, box), constants = tables(camera, device), numbers(camera)
+    fixed, constants = tables(camera, device), numbers(camera)
     full = sum(n * weight for n, weight in zip(camera.counts, camera.particle_weight, strict=True))
     kernel = cuda_picture.Kernel.of(dtype)
 
-    def draw(x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
-        x, v = (t.movedim(-1, 0).contiguous() for t in (x, v))
-        image = torch.empty(x.shape[1], *SHAPE, dtype=torch.uint8, device=x.device)
-        arrays = {"body": body, "box": box, "x": x, "v": v, "image": image}
-        arrays |= {"origin": origin.contiguous(), "centre": centre.contiguous()}
+    def draw(*given: Tensor) -> Tensor:
+        arrays = arrays_of(*given) | fixed
         cuda_picture.draw(driver, kernel, arrays, full, **constants)
-        return image
+        return arrays["image"]
 
     places = torch.from_numpy(sobol(2 * sum(camera.counts), seed=0)).view(2, -1, 2).to(device, dtype)
     origin = places.new_zeros(2, 2)

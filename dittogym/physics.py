@@ -32,15 +32,12 @@ _RANGES: dict[str, dict[str, float]] = {
 PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
 
-def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
-    """The task's own values for B simulations, B the length of ``like``."""
-    return {name: default(spec, name, like) for name in NAMES}
-
-
-def default(spec: TaskSpec, name: str, like: Tensor) -> Tensor:
-    """The task's own value of one of :data:`NAMES`, as :func:`defaults` gives it."""
-    value = getattr(spec, name, 1.0)  # a factor of 1 on the mass
-    return _expanded(constant(value, like), name, len(like))
+def value_of(name: str, physics: Physics, spec: TaskSpec, like: Tensor) -> Tensor:
+    """One of :data:`NAMES` for B simulations, B the length of ``like``: the task's own value unless physics hold it."""
+    if name in physics:
+        return physics[name]
+    own = getattr(spec, name, 1.0)  # a factor of 1 on the mass
+    return _expanded(constant(own, like), name, len(like))
 
 
 def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor]:
@@ -86,8 +83,8 @@ def check_effect(spec: TaskSpec, physics: Physics) -> None:
             alone = f"physics[{name!r}] changes the object of {spec.name} alone, not the robot with its own material"
             warnings.warn(alone, stacklevel=3)  # where TorchEnv.reset is called
     if physics.keys() & {"mu", "lam"}:
-        own = defaults(spec, next(iter(physics.values())))
-        mu, lam = _broadcast_pair(*(physics.get(name, own[name]).detach() for name in ("mu", "lam")))
+        like = next(iter(physics.values()))
+        mu, lam = _broadcast_pair(*(value_of(name, physics, spec, like).detach() for name in ("mu", "lam")))
         if bool((low := lam < -mu).any()):
             least = f"-mu, {-mu[low][0].item():g}"
             raise ValueError(f"physics['lam'] must be at least {least}, got {lam[low][0].item():g}")
@@ -117,25 +114,18 @@ def real_tensor(name: str, given: Any) -> Tensor:
 
 def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tensor) -> dict[str, Tensor]:
     """``new`` where ``mask`` (B,) holds, ``old`` elsewhere; the task's own value where one of them has none."""
-    result = {}
-    for name in NAMES:
-        if name in old or name in new:
-            one, other = (values[name] if name in values else default(spec, name, like) for values in (new, old))
-            result[name] = tree.where(mask, *_broadcast_pair(one, other))
-    return result
+    names = [name for name in NAMES if name in old or name in new]
+    pairs = {name: _broadcast_pair(*(value_of(name, each, spec, like) for each in (new, old))) for name in names}
+    return {name: tree.where(mask, *pair) for name, pair in pairs.items()}
 
 
 def bodies_of(
     spec: TaskSpec, counts: tuple[int, ...], particle_weight: tuple[float, ...], physics: Physics
 ) -> tuple[Body, ...]:
-    """Robot and objects as the solver has them.
+    """Robot and objects as the solver has them, with ``physics`` in place of the task's own constants.
 
-    Args:
-        spec: The task.
-        counts: Particles of each body.
-        particle_weight: By body, the full-size particles that one particle stands for: a factor on mass and volume, so
-            that density and stiffness mean the same for every particle count.
-        physics: Constants in place of the task's own.
+    The full-size particles that a particle of each body stands for are a factor on its mass and volume, so that density
+    and stiffness mean the same for every particle count.
     """
     values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
     bodies: list[Body] = []

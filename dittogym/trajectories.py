@@ -81,14 +81,10 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
     if unknown := [name for name in fields if name not in FIELDS]:
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
     act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env.action_layout)
-
-    def state() -> list[np.ndarray]:
-        return [getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields]
-
     observations, actions, ends, states = [], [], [], []
     for images, chosen, end in play(torch_env, act, seed):
         observations.append(images.copy())
-        states.append(state())
+        states.append([getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields])
         if chosen is not None:
             actions.append(chosen.copy())
             ends.append([value.item() for value in end[:3]])

@@ -13,8 +13,8 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.copies import to_device, to_host
-from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, flat, spaces
+from dittogym.copies import to_device
+from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, spaces, step_to_host
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
@@ -40,17 +40,13 @@ def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | np.ndarr
 
     A GPU is waited for once, by the copy of all quantities of the step, and again where an episode has ended.
     """
-    observation, *own, raw = env.step(action)
-    names = ("reward", "terminated", "truncated")
-    quantities = dict(zip(names, own, strict=True)) | {"steps": env.env_state.steps}
-    info = to_host(flat(raw) | {f"_{name}": value for name, value in quantities.items()})
-    reward, terminated, truncated, steps = (info.pop(f"_{name}") for name in quantities)
+    observation, (reward, terminated, truncated, steps), info = step_to_host(env, action)
     if max_episode_steps is not None:
         truncated = steps >= max_episode_steps
     done, finals, reset_info = terminated | truncated, {}, {}
     if done.any():
         ended = np.flatnonzero(done)
-        images = to_host({"": observation[to_device(ended, observation.device)]})[""]
+        images = as_numpy(observation[to_device(ended, observation.device)])
         finals = dict(zip(ended.tolist(), images, strict=True))
         observation, reset_info = env.reset(options={"reset_mask": torch.from_numpy(done)})
     return AutoresetStep(observation, reward, terminated, truncated, done, info, finals, reset_info)
@@ -165,11 +161,7 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         fresh = self._ended.copy()
         ended = to_device(fresh, action.device)
         action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
-        observation, *own, _, raw = self.torch_env.step(action)
-        names = ("_reward", "_terminated", "_steps")
-        quantities = dict(zip(names, (*own, self.torch_env.env_state.steps), strict=True))
-        info = to_host(flat(raw) | quantities)  # in one piece: a GPU is waited for once
-        reward, terminated, steps = (info.pop(name) for name in names)
+        observation, (reward, terminated, _, steps), info = step_to_host(self.torch_env, action)
         rewards = np.where(fresh, 0.0, reward.astype(np.float64))
         ends, limits = terminated & ~fresh, (steps >= self._horizon) & ~fresh
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:

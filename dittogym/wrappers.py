@@ -30,9 +30,7 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
         ValueError: ``size`` is not a whole number in this range.
         TypeError: ``env`` is not a Gymnasium environment with a ``Box`` of actions.
     """
-    box = _box(env, "action_space")
-    size = checks.whole("size", size, 1, box.shape[-1])
-    small = _resized_space(box, size)
+    box, small = _spaces(env, "action_space", size)
     enlarge = functools.partial(_enlarged, small=small, largest=box.shape[-1])
     if isinstance(env, VectorEnv):
         batch = batch_space(small, env.num_envs)
@@ -51,10 +49,8 @@ def observation_resolution(env: AnyEnv, size: int) -> Any:
         ValueError: ``size`` is not a whole number in this range.
         TypeError: ``env`` is not a Gymnasium environment with a ``Box`` of observations.
     """
-    box = _box(env, "observation_space")
-    size = checks.whole("size", size, 1, box.shape[-1])
-    small = _resized_space(box, size)
-    reduce = functools.partial(_resized, size=size, interpolation=cv2.INTER_AREA)
+    _, small = _spaces(env, "observation_space", size)
+    reduce = functools.partial(_resized, size=small.shape[-1], interpolation=cv2.INTER_AREA)
     if isinstance(env, VectorEnv):
         return _VectorObservation(env, reduce, small)
     return gymnasium.wrappers.TransformObservation(env, reduce, small)
@@ -84,18 +80,18 @@ class _VectorObservation(VectorWrapper):
         return self._function(observation), reward, terminated, truncated, info
 
 
-def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
-    space = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name, None)
-    if not isinstance(space, gymnasium.spaces.Box):
+def _spaces(env: AnyEnv, name: str, size: int) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """The space of a single environment's images, and that of resized ones.
+
+    Both have the same range, which another wrapper may have changed.
+    """
+    box = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name, None)
+    if not isinstance(box, gymnasium.spaces.Box):
         kind = type(env).__name__
         raise TypeError(f"env must be a Gymnasium environment of images (TorchEnv has resolution=...), got {kind}")
-    return space
-
-
-def _resized_space(box: gymnasium.spaces.Box, size: int) -> gymnasium.spaces.Box:
-    """The space of resized images, with the range of ``box``, which another wrapper may have changed."""
+    size = checks.whole("size", size, 1, box.shape[-1])
     low, high = box.low.min().item(), box.high.max().item()
-    return gymnasium.spaces.Box(low, high, (*box.shape[:-2], size, size), box.dtype.type)
+    return box, gymnasium.spaces.Box(low, high, (*box.shape[:-2], size, size), box.dtype.type)
 
 
 def _enlarged(action: np.ndarray, small: gymnasium.spaces.Box, largest: int) -> np.ndarray:

@@ -23,14 +23,9 @@ class VideoUnavailable(ImportError):
     """The optional packages that write MP4 files are not installed, or their ffmpeg fails."""
 
 
-def available() -> bool:
-    """Whether the optional packages that write MP4 files are installed."""
-    return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
-
-
 def check_available() -> None:
-    """Raise `VideoUnavailable` unless MP4 files can be written."""
-    if not available():
+    """Raise `VideoUnavailable` unless the optional packages that write MP4 files are installed."""
+    if not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
         raise VideoUnavailable("MP4 needs imageio with ffmpeg: pip install 'torchmpm[video]'")
 
 
@@ -43,10 +38,8 @@ def possible_rate(suffix: str, rate: float) -> float:
 def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Write one or more pictures, (H, W, 3) uint8, of which the last is shown a second longer.
 
-    Args:
-        path: The file, which is replaced only when all of it is written; its suffix is one of :data:`UNITS`.
-        frames: The pictures.
-        rate: Pictures per second, see :func:`possible_rate`.
+    A file, with a suffix of :data:`UNITS`, is replaced only when all of it is written. The rate is that of
+    :func:`possible_rate`, pictures per second.
 
     Raises:
         VideoUnavailable: MP4 without imageio and an ffmpeg with libx264.

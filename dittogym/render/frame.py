@@ -39,17 +39,7 @@ def frame(
     caption: tuple[str, str] | None = None,
     legend: bool = False,
 ) -> np.ndarray:
-    """Draw one moment, (size, size, 3) uint8 RGB.
-
-    Args:
-        scene: The static parts of the scene.
-        shot: The moment.
-        size: Pixels per side.
-        zoom: The picture shows 1 / zoom metres; ``None``: a little more than the robot observes.
-        muscles: Colour the robot by its muscles: contraction red, expansion blue.
-        caption: What to write into the upper left and the upper right corner.
-        legend: Say below the caption what the colours mean.
-    """
+    """Draw one moment, (size, size, 3) uint8 RGB; options as in :meth:`dittogym.render.recording.Recording.picture`."""
     width = check_view(size, zoom)
     checks.flag("muscles", muscles)
     canvas = Canvas(size, shot.corner(width), width)

@@ -115,8 +115,8 @@ class Recording:
             time: s.
             size: Pixels per side.
             zoom: As in :meth:`dittogym.TorchEnv.render`.
-            muscles: Colour the robot by its muscles.
-            caption: What to write into the upper corners.
+            muscles: Colour the robot by its muscles: contraction red, expansion blue.
+            caption: What to write into the upper left and the upper right corner.
             legend: Say below the caption what the colours mean.
 
         Raises:

@@ -27,6 +27,10 @@ def env(**changes):
     return TorchEnv(**{"task": "run", **SMALL, "backend": "eager", **changes})
 
 
+def grow(**conditions):
+    return env(task="grow", conditions=conditions)
+
+
 def begun(**changes):
     made = env(num_envs=2, **changes)
     made.reset(seed=0)
@@ -161,6 +165,23 @@ VALUES = [
     ("max_episode_steps", lambda: batch(max_episode_steps=-2)),
     ("size", lambda: observation_resolution(batch(), 65)),
     ("action", lambda: step(action_resolution(single(), 4), np.zeros((2, 5, 5), np.float32))),
+    # Conditions.
+    *(("latency", lambda value=value: grow(latency=value)) for value in (0.5, (-1, 2), (2, 1))),
+    *(("action_noise", lambda value=value: grow(action_noise=value)) for value in (-0.1, NAN)),
+    ("action_dropout must be at most 1, got 1.5", lambda: grow(action_dropout=(0.5, 1.5))),
+    ("observation_dropout must be a number or a pair", lambda: grow(observation_dropout=(0, 0.1, 0.2))),
+    ("mu must be positive", lambda: grow(mu=0.0)),
+    ("yield_stress must be a number", lambda: grow(yield_stress="1")),
+    ("shift must be a number, got (0.0, 0.1)", lambda: grow(shift=(0.0, 0.1))),
+    ("chance", lambda: grow(chance=1.1)),
+    *(("grid", lambda size=size: grow(grid=size)) for size in (0, 9)),
+    ("'friction'", lambda: grow(friction=1.0)),
+    ("conditions", lambda: env(conditions=0.5)),
+    ("matter stable, got {'mu': (1.0, 500.0)}, with which dt must be at most", lambda: grow(mu=(1.0, 500.0))),
+    ("matter stable", lambda: grow(gravity=1e6)),
+    ("robot room, got shift=0.2 and turn=0", lambda: grow(shift=0.2)),
+    ("the obstacle 'right beam'", lambda: grow(turn=45.0)),
+    ("place of the object", lambda: env(task="kick", conditions={"shift": 0.15})),
     # Resets, snapshots and states.
     *(("seed", lambda seed=seed: reset(seed)) for seed in (1.5, 2**32 - 1, [1], [1, -2])),
     ("options", lambda: env().reset(options=[1])),
@@ -262,7 +283,8 @@ VALUES = [
     # Tasks.
     ("task", lambda: register(make_spec, "run")),
     ("task", lambda: register(dittogym.TASKS["run"])),
-    ("make", lambda: register(lambda particles=3, body=None: spec())),
+    ("make must have arguments of other names", lambda: register(lambda conditions=None: spec())),
+    ("got body, particles", lambda: register(lambda particles=3, body=None: spec())),
     ("variant", lambda: make_spec("slot", variant="soft")),
     ("goal", lambda: env(task=replace(make_spec("grow"), goal=(9.0, 0.0)))),
     ("goal", lambda: spec(goal=(1.0, 2.0, 3.0))),

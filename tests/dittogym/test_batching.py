@@ -1,13 +1,14 @@
 """Batches: equal to single environments, repeatable, and no element harms another; for every task."""
 
+import itertools
 import random
 
 import numpy as np
 import pytest
 import torch
-from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, set_particles, stir, tiny
+from tiny import ALL, FIXED, TASKS, actions, assert_same_bits, everything, leaves, set_particles, stir, tiny
 
-from dittogym import BatchEnv, TorchEnv, core
+from dittogym import TorchEnv, core
 from dittogym.core import FAILURE_REWARD
 
 
@@ -21,14 +22,27 @@ def assert_element_is(batch: TorchEnv, result: tuple, i: int, single: TorchEnv, 
         assert np.abs(ours[i].astype(np.float64) - theirs[0]).max() <= bound, path
 
 
-@pytest.mark.parametrize("task", TASKS)
+#: Of each of three elements.
+PHYSICS = {
+    "mu": [300.0, 600.0, 900.0],
+    "lam": [20.0, 50.0, 80.0],
+    "yield_stress": [5.0, 50.0, 90.0],
+    "max_actuation": [20.0, 0.0, 50.0],
+    "gravity": [[0.0, -12.0], [3.0, -9.0], [0.0, 0.0]],
+    "mass": [0.5, 1.0, 2.0],
+}
+
+
+@pytest.mark.parametrize(("task", "given"), [*itertools.product(TASKS, ("nothing", "conditions")), ("kick", "physics")])
 @torch.no_grad()
-def test_a_batch_is_its_single_environments(task: str) -> None:
+def test_a_batch_is_its_single_environments(task: str, given: str) -> None:
     """Random actions and velocities, an element reset alone, and two reset with new seeds."""
-    batch, singles = tiny(task, 3), [tiny(task) for _ in range(3)]
-    seen, info = batch.reset(seed=7)
+    conditions, physics = ALL if given == "conditions" else None, PHYSICS if given == "physics" else {}
+    batch, *singles = (tiny(task, n, conditions=conditions, substeps=8) for n in (3, 1, 1, 1))
+    start = batch.reset(seed=7, options={"physics": physics})
     for i, env in enumerate(singles):
-        assert_element_is(batch, (seen, info), i, env, env.reset(seed=7 + i))
+        own = {name: values[i] for name, values in physics.items()}
+        assert_element_is(batch, start, i, env, env.reset(seed=7 + i, options={"physics": own}))
         stir(env, i)
     stir(batch)
     for t, action in enumerate(actions(batch, 6)):
@@ -43,31 +57,6 @@ def test_a_batch_is_its_single_environments(task: str) -> None:
         for i, env in enumerate(singles):
             assert_element_is(batch, result, i, env, env.step(action[i : i + 1]))
     assert batch.env_state.steps.tolist() == [2, 4, 2]
-
-
-@torch.no_grad()
-def test_a_batch_with_physics_of_each_element_is_its_single_environments() -> None:
-    physics = {
-        "mu": [300.0, 600.0, 900.0],
-        "lam": [20.0, 50.0, 80.0],
-        "yield_stress": [5.0, 50.0, 90.0],
-        "max_actuation": [20.0, 0.0, 50.0],
-        "gravity": [[0.0, -12.0], [3.0, -9.0], [0.0, 0.0]],
-        "mass": [0.5, 1.0, 2.0],
-    }
-    batch, singles = tiny("kick", 3, substeps=20), [tiny("kick", substeps=20) for _ in range(3)]
-    batch.reset(seed=3, options={"physics": physics})
-    stir(batch)
-    for i, env in enumerate(singles):
-        env.reset(seed=3 + i, options={"physics": {name: values[i] for name, values in physics.items()}})
-        stir(env, i)
-    for t, action in enumerate(actions(batch, 4)):
-        if t == 2:
-            batch.reset(options={"reset_mask": [False, False, True]})
-            singles[2].reset()
-        result = batch.step(action)
-        for i, env in enumerate(singles):
-            assert_element_is(batch, result, i, env, env.step(action[i : i + 1]))
 
 
 def episode(task: str) -> list:
@@ -133,18 +122,6 @@ def test_an_element_fails_alone(task: str, how: str) -> None:
             assert terms.pop("failure") == FAILURE_REWARD and not any(terms.values())
             assert "is_success" not in info or not info["is_success"][1]
     assert info["finite"].all() and float(info["reward_terms"]["failure"][1]) == 0.0
-
-
-def test_a_failed_element_of_a_vector_environment_starts_anew() -> None:
-    env = BatchEnv("grow", 3, autoreset_mode="SameStep", **SMALL)
-    env.reset(seed=0)
-    env.state.v[1] = torch.nan
-    _, rewards, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
-    assert terminated.tolist() == [False, True, False] and rewards[1] == FAILURE_REWARD
-    assert info["final_info"]["_finite"].tolist() == [False, True, False]
-    assert not info["final_info"]["finite"].any() and info["finite"].all()
-    _, _, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
-    assert info["finite"].all() and not terminated.any()
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -12,29 +12,12 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, tiny
+from tiny import ALL, FIXED, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, tiny
 
-import dittogym
 from dittogym import Conditions, TorchEnv
 from dittogym import conditions as drawing
 from dittogym.action import bicubic
 from torchmpm import tree
-
-#: Every condition, with ranges for which each task has room.
-ALL = Conditions(
-    latency=(0, 2),
-    action_noise=(0.0, 0.3),
-    action_dropout=(0.0, 0.5),
-    observation_dropout=(0.0, 0.5),
-    mu=(0.8, 1.2),
-    yield_stress=(0.5, 1.5),
-    gravity=(0.9, 1.1),
-    shift=0.01,
-    turn=5.0,
-    velocity=0.5,
-    chance=0.7,
-    grid=4,
-)
 
 
 def varied(task: str = "run", num_envs: int = 1, **ranges: Any) -> TorchEnv:
@@ -296,24 +279,6 @@ def test_starts_that_are_not_moved_keep_every_bit() -> None:
     assert rests.any() and torch.equal((env.state.x == plain.state.x).all(2).all(1), rests)
 
 
-@pytest.mark.parametrize("task", TASKS)
-@torch.no_grad()
-def test_an_element_has_its_episode_in_any_batch(task: str) -> None:
-    batch, singles = tiny(task, 3, conditions=ALL), [tiny(task, conditions=ALL) for _ in range(3)]
-    seen = batch.reset(seed=5)[0]
-    for i, env in enumerate(singles):
-        assert torch.equal(env.reset(seed=5 + i)[0][0], seen[i])
-    for t, action in enumerate(actions(batch, 4)):
-        if t == 2:  # without a seed: the next episodes
-            batch.reset(options={"reset_mask": [False, True, False]}), singles[1].reset()
-        result = batch.step(action)
-        for i, env in enumerate(singles):
-            single = env.step(action[i : i + 1])
-            assert torch.equal(single[0][0], result[0][i])
-            for ours, theirs in zip(everything(batch), everything(env), strict=True):
-                assert (ours[i] - theirs[0]).abs().max() <= 1e-9 * max(1.0, theirs.abs().max())
-
-
 # Resets, states and snapshots.
 
 
@@ -346,51 +311,6 @@ def test_environments_that_are_never_seeded_differ() -> None:
     first.reset(), second.reset()
     seeds = torch.cat((first.env_state.conditions["seed"], second.env_state.conditions["seed"]))
     assert len(seeds.unique()) == 4
-
-
-@torch.no_grad()
-def test_a_reset_that_raises_changes_nothing() -> None:
-    env = tiny("run", 2, conditions={**vars(ALL), "mu": 4.0})
-    env.reset(seed=0)
-    env.step(actions(env, 1)[0])
-    before = tree.map(torch.Tensor.clone, env.env_state)
-    for options in ({"physics": {"mu": 4e4}}, {"physics": {"mu": -1.0}}, {"positions": torch.zeros(3, 2)}):
-        with pytest.raises(ValueError, match=r"mu|positions"):
-            env.reset(seed=1, options=options)
-    assert_same_bits(everything(env), tree.leaves(before))
-    twin = tiny("run", 2, conditions=env.conditions)
-    twin.reset(seed=0), twin.reset(), env.reset()
-    assert_same_bits(everything(env), everything(twin))
-
-
-@pytest.mark.parametrize("task", TASKS)
-@torch.no_grad()
-def test_a_loaded_moment_goes_on_with_its_conditions(task: str, tmp_path: Any) -> None:
-    """With the actions that are pending, in other environments, through a file, and in some elements alone."""
-    conditions = {**vars(ALL), "latency": 2}
-    env = tiny(task, 2, conditions=conditions)
-    env.reset(seed=4)
-    drive = actions(env, 5)
-    for action in drive[:2]:
-        seen = env.step(action)[0]
-    torch.save(env.save(), tmp_path / "moment.pt")
-    moment = torch.load(tmp_path / "moment.pt", weights_only=True)
-    future = [(env.step(action), everything(env)) for action in drive[2:]]
-    env.reset()
-    future += [everything(env)]
-    other = tiny(task, 2, conditions=conditions)
-    other.reset(seed=4)
-    assert torch.equal(other.load(moment), seen)
-    again = [(other.step(action), everything(other)) for action in drive[2:]]
-    other.reset()
-    assert_same_bits([*again, everything(other)], future)
-    third = tiny(task, 2, conditions=conditions)
-    third.reset(seed=30)
-    third.load(moment, [False, True])
-    kept, loaded = conditions_of(third), moment.state.conditions
-    for name, value in kept.items():
-        assert torch.equal(value[1], loaded[name][1])
-    assert kept["seed"][0] == 30
 
 
 @torch.no_grad()
@@ -462,56 +382,6 @@ def test_detached_states_hold_no_graph() -> None:
     assert not any(leaf.requires_grad for leaf in everything(env))
 
 
-def test_gradients_after_a_reset_in_inference_mode() -> None:
-    results = []
-    for inference in (False, True):
-        env = tiny("run", 2, conditions=ALL)
-        with torch.inference_mode(inference), torch.no_grad():
-            env.reset(seed=0)
-            env.step(actions(env, 1)[0])
-        drive = actions(env, 3, seed=1).requires_grad_()
-        sum(env.step(action, soft=True)[1].sum() for action in drive).backward()
-        results.append(drive.grad)
-    assert results[0].abs().max() > 0 and torch.equal(*results)
-
-
-# Arguments.
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"latency": 0.5}, "latency must be a whole number, got 0.5"),
-        ({"latency": (-1, 2)}, "latency must not be negative, got -1"),
-        ({"latency": (2, 1)}, r"latency must be a pair \(lowest, highest\), got \(2, 1\)"),
-        ({"action_noise": -0.1}, "action_noise must not be negative"),
-        ({"action_noise": math.nan}, "action_noise must be finite"),
-        ({"action_dropout": (0.5, 1.5)}, "action_dropout must be at most 1, got 1.5"),
-        ({"observation_dropout": (0, 0.1, 0.2)}, r"observation_dropout must be a number or a pair"),
-        ({"mu": 0.0}, "mu must be positive, got 0.0"),
-        ({"yield_stress": "1"}, "yield_stress must be a number, got '1'"),
-        ({"shift": (0.0, 0.1)}, r"shift must be a number, got \(0.0, 0.1\)"),
-        ({"chance": 1.1}, "chance must be at most 1, got 1.1"),
-        ({"grid": 0}, "grid must be at least 1, got 0"),
-        ({"friction": 1.0}, "conditions may hold latency, .*, got 'friction'"),
-        (0.5, "conditions must be dittogym.Conditions or a mapping, got float"),
-        ({"grid": 9}, "conditions must have a grid of at most 8, as actions have, got 9"),
-        ({"mu": (1.0, 500.0)}, "conditions must leave the matter stable, got .*500.*dt must be at most"),
-        ({"gravity": 1e6}, "conditions must leave the matter stable"),
-        ({"shift": 0.2}, "conditions must leave the robot room, got shift=0.2 and turn=0, .* 'side walls'"),
-        ({"turn": 45.0}, "conditions must leave the robot room, got shift=0 and turn=45, .* 'right beam'"),
-    ],
-)
-def test_what_cannot_be_is_refused_when_an_environment_is_made(given: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        tiny("grow", conditions=given)
-
-
-def test_no_start_is_at_the_place_of_the_object() -> None:
-    with pytest.raises(ValueError, match=r"conditions must leave the robot room.*place of the object"):
-        tiny("kick", conditions={"shift": 0.15})
-
-
 # Behind Gymnasium.
 
 
@@ -531,17 +401,3 @@ def test_through_gymnasium(task: str) -> None:
     images = vector.reset(seed=7)[0]
     for i in range(2):
         assert np.array_equal(made[0].reset(seed=7 + i)[0], images[i])
-
-
-def test_the_environments_of_the_ids_have_none() -> None:
-    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
-    env.reset(seed=0)
-    assert env.unwrapped.torch_env.conditions is None and env.unwrapped.torch_env.env_state.conditions == {}
-
-
-def test_a_task_of_ones_own_keeps_another_name_for_its_option() -> None:
-    def windy(conditions: str = "calm") -> dittogym.TaskSpec:
-        return dittogym.make_spec("run")
-
-    with pytest.raises(ValueError, match="conditions"):
-        dittogym.register("windy", windy)

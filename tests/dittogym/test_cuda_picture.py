@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 import torch
-from test_native_picture import drawn_as
-from tiny import TASKS, actions, set_particles, tiny
+from test_native_picture import lost, scene
+from tiny import TASKS, tiny
 from torch import Tensor
 
 import dittogym
@@ -71,24 +71,12 @@ def draw(env: dittogym.TorchEnv, gpu: Gpu | None = None) -> Tensor:
     return cuda_drawing(env.model.camera, env.dtype, CPU, gpu or Gpu())(*arrays)
 
 
-def scene(task: str, pixels: bool, dtype: str = "float32", num_envs: int = 2) -> dittogym.TorchEnv:
-    """Robots in motion, and particles anywhere."""
-    env = drawn_as(tiny(task, num_envs, dtype=dtype), pixels)
-    env.reset(seed=2)
-    with torch.no_grad():
-        env.step(actions(env, 1)[0])
-    generator = torch.Generator().manual_seed(0)
-    x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
-    set_particles(env, x=x, v=4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
-    return env
-
-
 @pytest.mark.parametrize("pixels", [False, True])
 @pytest.mark.parametrize("task", TASKS)
 def test_equals_torch(task: str, pixels: bool) -> None:
     """Sums are rounded elsewhere: in one of a thousand pixels a byte may be one off."""
     for dtype in ("float32", "float64") if task in ("run", "dig") else ("float32",):
-        env = scene(task, pixels, dtype)
+        env = scene(task, pixels, dtype=dtype)
         state = env.env_state
         plain = env.model.camera.draw(state.particles.x, state.particles.v, state.origin, state.centre)
         difference = (draw(env).int() - plain.int()).abs()
@@ -98,13 +86,8 @@ def test_equals_torch(task: str, pixels: bool) -> None:
 
 @pytest.mark.parametrize("pixels", [False, True])
 def test_what_is_not_drawn(pixels: bool) -> None:
-    """Particles that are not finite, or anywhere else in the world; a robot that is nowhere harms no other."""
-    env = scene("kick", pixels, "float64", num_envs=3)
-    x, v = env.state.x.clone(), env.state.v.clone()
-    x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
-    x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
-    x[1, 5:10, 1] += 0.9
-    set_particles(env, x=x, v=v)
+    """A robot that is nowhere harms no other."""
+    env = lost(scene("kick", pixels, 3))
     state = env.env_state
     state.centre[2] = math.nan
     plain = env.model.camera.draw(state.particles.x, state.particles.v, state.origin, state.centre)
@@ -113,7 +96,7 @@ def test_what_is_not_drawn(pixels: bool) -> None:
 
 @pytest.mark.parametrize("pixels", [False, True])
 def test_order_of_threads_makes_no_difference(pixels: bool) -> None:
-    env = scene("dig", pixels)
+    env = scene("dig", pixels, dtype="float32")
     first = draw(env)
     for seed in range(1, 4):
         assert torch.equal(draw(env, Gpu(seed)), first)
@@ -128,7 +111,7 @@ def test_order_of_threads_makes_no_difference(pixels: bool) -> None:
 )
 def test_barriers_and_atomic_operations_are_needed(pixels: bool, broken: dict[str, int]) -> None:
     """Without one of them, some order of the threads draws something else."""
-    env = scene("dig", pixels)
+    env = scene("dig", pixels, dtype="float32")
     expected = draw(env)
 
     def noticed(seed: int) -> bool:

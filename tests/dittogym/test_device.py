@@ -13,16 +13,13 @@ import pytest
 import torch
 from device_operators import DeviceOperators
 from stable_baselines3.common.vec_env import VecEnv
-from tiny import SMALL, TASKS, actions, assert_same_bits, make_vec, tiny
+from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, make_vec, tiny
 
 from cfp.envs.vec_env import TorchVecEnv
 from dittogym import TorchEnv, copies, core
 
 #: A reset of some elements copies to the host what the mask is, unless that lies there, and nothing else.
 MASK = {"torch.cpu": 1, "torch.numpy": 1}
-#: One condition of each kind.
-CONDITIONS = {"latency": (0, 2), "action_noise": 0.1, "action_dropout": 0.2, "observation_dropout": 0.2}
-CONDITIONS |= {"mu": (0.8, 1.2), "gravity": 0.9, "turn": 2.0, "velocity": 0.1, "grid": 4}
 
 
 def on_a_gpu(env: TorchEnv) -> TorchEnv:
@@ -65,7 +62,7 @@ def test_what_would_not_wait_is_only_counted() -> None:
     assert not seen.waits and sum(seen.launches.values()) == 6
 
 
-@pytest.mark.parametrize("conditions", [None, CONDITIONS])
+@pytest.mark.parametrize("conditions", [None, ALL])
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("task", TASKS)
 def test_a_step_waits_for_nothing(task: str, soft: bool, conditions: Any) -> None:
@@ -78,7 +75,7 @@ def test_a_step_waits_for_nothing(task: str, soft: bool, conditions: Any) -> Non
     assert not seen.waits
 
 
-@pytest.mark.parametrize("conditions", [None, CONDITIONS])
+@pytest.mark.parametrize("conditions", [None, ALL])
 @pytest.mark.parametrize("physics", [None, {"mu": [500.0, 600.0, 700.0], "gravity": (0.0, -5.0)}])
 @pytest.mark.parametrize("task", ["run", "shapematch", "grow", "catch"])
 def test_a_reset_waits_for_its_mask_alone(task: str, physics: dict[str, Any] | None, conditions: Any) -> None:
@@ -132,8 +129,7 @@ def test_interfaces_of_arrays_wait_once(monkeypatch: pytest.MonkeyPatch) -> None
             assert_same_bits(copies.unpack(copies.pack(tensors).numpy(), tensors), found)
         return found
 
-    for module in ("dittogym.env", "dittogym.vector"):
-        monkeypatch.setattr(f"{module}.to_host", to_host)
+    monkeypatch.setattr("dittogym.env.to_host", to_host)
     single, batch = gymnasium.make("dittogym/run-coarse-v0", **SMALL), make_vec("run", 2)
     vec: VecEnv = TorchVecEnv(tiny("kick", 2), max_episode_steps=2)
     single.reset(seed=0), batch.reset(seed=0), vec.reset()

@@ -50,12 +50,12 @@ def test_step_and_info() -> None:
     assert env.unwrapped.state.x.shape == (1, 120, 2)
 
 
-def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> tuple[list[tuple], dict]:
-    """Results of a reset and of some steps, and the info of the reset."""
-    first, start = vector.reset(seed=0)
+def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> list[tuple]:
+    """Results of a reset and of some steps."""
+    start = vector.reset(seed=0)
     action = np.zeros(vector.action_space.shape, np.float32)
     action[0] = 1.0
-    return [(first, None, None, None, start)] + [vector.step(action) for _ in range(steps)], start
+    return [start, *(vector.step(action) for _ in range(steps))]
 
 
 def assert_reset(info: dict, start: dict) -> None:
@@ -67,8 +67,8 @@ def assert_reset(info: dict, start: dict) -> None:
 
 
 def test_same_step_autoreset() -> None:
-    rows, start = episode(make_vec("kick", autoreset_mode="SameStep", max_episode_steps=3), 4)
-    first, last = rows[0][0], rows[3]
+    rows = episode(make_vec("kick", autoreset_mode="SameStep", max_episode_steps=3), 4)
+    (first, start), last = rows[0], rows[3]
     assert last[3].tolist() == [True, True] and not rows[2][3].any()
     assert np.array_equal(last[0], first)
     assert last[4]["_final_obs"].all() and not np.array_equal(last[4]["final_obs"][0], first[0])
@@ -78,24 +78,30 @@ def test_same_step_autoreset() -> None:
     assert_reset(last[4], start)
 
 
-def test_final_infos_hold_what_ended_alone() -> None:
-    """As Gymnasium's own do, in which a mean over elements that go on would count them as well."""
+def test_a_failed_element_starts_anew() -> None:
+    """Final infos hold it alone: as in Gymnasium's own, a mean over the others would count them as well."""
     vector = make_vec("grow", 3, autoreset_mode="SameStep")
     vector.reset(seed=0)
     vector.unwrapped.state.v[1] = torch.nan
-    final = vector.step(np.zeros(vector.action_space.shape, np.float32))[4]["final_info"]
-    assert final["_reward_terms/alive"].tolist() == [False, True, False]
+    still = np.zeros(vector.action_space.shape, np.float32)
+    _, rewards, terminated, _, info = vector.step(still)
+    assert terminated.tolist() == [False, True, False] and rewards[1] == -16.0
+    final = info["final_info"]
+    assert final["_reward_terms/alive"].tolist() == final["_finite"].tolist() == [False, True, False]
     assert final["reward_terms/failure"].tolist() == [0.0, -16.0, 0.0] and not final["com"][[0, 2]].any()
+    assert not final["finite"].any() and info["finite"].all()
+    _, _, terminated, _, info = vector.step(still)
+    assert info["finite"].all() and not terminated.any()
 
 
 def test_next_step_autoreset() -> None:
     vector = make_vec("kick", max_episode_steps=3)
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP  # as Gymnasium's own have it
-    rows, start = episode(vector, 5)
+    rows = episode(vector, 5)
     assert rows[3][3].all() and not np.array_equal(rows[3][0], rows[0][0])
     assert np.array_equal(rows[4][0], rows[0][0]) and not rows[4][1].any() and not rows[4][3].any()
     assert not np.array_equal(rows[5][0], rows[0][0]) and rows[5][1].all()
-    assert_reset(rows[4][4], start)
+    assert_reset(rows[4][4], rows[0][1])
 
 
 def test_the_step_in_which_an_element_is_reset_has_no_reward() -> None:
@@ -111,14 +117,14 @@ def test_the_step_in_which_an_element_is_reset_has_no_reward() -> None:
 
 def test_disabled_autoreset_with_a_mask() -> None:
     vector = make_vec(autoreset_mode="Disabled", max_episode_steps=2)
-    rows, _ = episode(vector, 2)
+    rows = episode(vector, 2)
     assert rows[2][3].all()
     seen, _ = vector.reset(options={"reset_mask": np.array([True, False])})
     assert np.array_equal(seen[0], rows[0][0][0]) and np.array_equal(seen[1], rows[2][0][1])
 
 
 def test_a_batch_without_a_time_limit() -> None:
-    rows, _ = episode(make_vec("shapematch", max_episode_steps=-1, substeps=1), 31)
+    rows = episode(make_vec("shapematch", max_episode_steps=-1, substeps=1), 31)
     assert not any(row[3].any() for row in rows[1:])
 
 

@@ -10,12 +10,11 @@ from functools import cache
 
 import pytest
 import torch
-from tiny import actions, tiny
+from tiny import actions, set_particles, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, make_spec
 from dittogym.spec import TaskSpec
-from torchmpm import ParticleState
 from torchmpm.backends import compiler_found
 
 TASKS = ("shapematch", "run", "kick", "dig")
@@ -74,9 +73,7 @@ def losses(env: TorchEnv, given: Leaves) -> tuple[Tensor, ...]:
     """Random combinations of the final state and image, and the sums of soft and of true rewards."""
     physics = {name: given[name] for name in (*MATTER, "max_actuation", "gravity")}
     env.reset(seed=0, options={"positions": given["x"], "physics": physics})
-    state = env.env_state
-    particles = ParticleState(state.particles.x, given["v"], given["C"], given["F"], state.particles.Jp)
-    env.env_state = replace(state, particles=particles)
+    set_particles(env, v=given["v"], C=given["C"], F=given["F"])
     soft = true = torch.zeros(B, dtype=torch.float64)
     for action in given["action"]:
         image, reward, *_, info = env.step(action, soft=True)

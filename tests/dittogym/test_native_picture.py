@@ -21,9 +21,27 @@ def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:
     return core.observe(env.model, env.env_state), core.observe(plain, env.env_state)
 
 
-def drawn_as(env: dittogym.TorchEnv, pixels: bool) -> dittogym.TorchEnv:
-    """The environment with particles that set pixels, as with full counts, or are splats."""
+def scene(task: str, pixels: bool, num_envs: int = 2, **options: object) -> dittogym.TorchEnv:
+    """Robots in motion, and particles anywhere, which set pixels, as with full counts, or are splats."""
+    env = tiny(task, num_envs, **options)
     env.model = replace(env.model, camera=replace(env.model.camera, pixels=pixels))
+    env.reset(seed=2)
+    with torch.no_grad():
+        for action in actions(env, 2):
+            env.step(action)
+    generator = torch.Generator().manual_seed(0)
+    x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
+    set_particles(env, x=x, v=4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
+    return env
+
+
+def lost(env: dittogym.TorchEnv) -> dittogym.TorchEnv:
+    """The scene with particles of the first two simulations that are not finite, or anywhere else in the world."""
+    x, v = env.state.x.clone(), env.state.v.clone()
+    x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
+    x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
+    x[1, 5:10, 1] += 0.9
+    set_particles(env, x=x, v=v)
     return env
 
 
@@ -32,14 +50,7 @@ def drawn_as(env: dittogym.TorchEnv, pixels: bool) -> dittogym.TorchEnv:
 @pytest.mark.parametrize("task", TASKS)
 def test_same_bytes(task: str, pixels: bool, dtype: str) -> None:
     """Splats are added in another order, so that a sum on the edge of two bytes may be either. Pixels may not."""
-    env = drawn_as(tiny(task, 3, particles=600, dtype=dtype), pixels)
-    env.reset(seed=2)
-    with torch.no_grad():
-        for action in actions(env, 2):
-            env.step(action)
-    generator = torch.Generator().manual_seed(0)
-    x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
-    set_particles(env, x=x, v=4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
+    env = scene(task, pixels, 3, particles=600, dtype=dtype)
     ours, plain = both(env)
     assert len(ours.unique()) > 20
     differs = (ours.int() - plain.int()).abs()
@@ -49,16 +60,10 @@ def test_same_bytes(task: str, pixels: bool, dtype: str) -> None:
 
 @pytest.mark.parametrize("pixels", [False, True])
 def test_what_is_not_drawn(pixels: bool) -> None:
-    """Particles that are not finite, or anywhere else in the world."""
-    env = drawn_as(tiny("kick", 2), pixels)
+    env = tiny("kick", 2)
+    env.model = replace(env.model, camera=replace(env.model.camera, pixels=pixels))
     env.reset(seed=0)
-    x, v = env.state.x.clone(), env.state.v.clone()
-    x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
-    x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
-    x[1, 5:10, 1] += 0.9
-    set_particles(env, x=x, v=v)
-    ours, plain = both(env)
-    assert torch.equal(ours, plain)
+    assert torch.equal(*both(lost(env)))
 
 
 def test_centre_that_is_not_a_number() -> None:

@@ -10,7 +10,6 @@ from tiny import TASKS, tiny
 import dittogym
 from dittogym.core import StepResult, evaluate
 from dittogym.observation import silhouette
-from torchmpm import ParticleState
 
 
 def judge(
@@ -37,7 +36,7 @@ def judge(
     env = tiny(task, 1)
     env.reset(seed=0)
     state, count = env.env_state, env.model.num_robot_particles
-    old, x, v, origin = state.particles, state.particles.x.clone(), state.particles.v.clone(), state.origin.clone()
+    x, v, origin = state.particles.x.clone(), state.particles.v.clone(), state.origin.clone()
     x[:, :count] += torch.tensor(robot)
     if env.spec.window.moves:
         origin[:, 0] += robot[0]
@@ -51,7 +50,7 @@ def judge(
     if speed is not None:
         v[:] = torch.tensor(speed)
     entries = {name: torch.full_like(state.task_state[name], value) for name, value in (task_state or {}).items()}
-    particles = ParticleState(x, v, old.C, old.F, old.Jp)
+    particles = replace(state.particles, x=x, v=v)
     state = replace(state, particles=particles, origin=origin, task_state={**state.task_state, **entries})
     return evaluate(env.model, state, torch.zeros(1, 2, env.spec.patch, env.spec.patch, dtype=env.dtype))
 

@@ -89,14 +89,6 @@ def test_matter_that_lies_far_apart() -> None:
     assert tuple(canvas.image[128, 128]) == GROUND
 
 
-def test_particles_that_are_not_finite_are_left_out() -> None:
-    env = TorchEnv("run", 1, particles=100)
-    env.reset(seed=0)
-    env.state.x[0, :50] = torch.nan
-    env.render(muscles=True)
-    assert len(near(env.render(), ROBOT)[0]) > 0
-
-
 def test_holes_of_a_target_stay_empty() -> None:
     """A ring with a disc in it."""
     y, x = np.mgrid[:64, :64] - 31.5

@@ -1,7 +1,6 @@
 """What a user holds is his own: changing it changes neither the environment nor its next resets."""
 
 import numpy as np
-import pytest
 import torch
 from tiny import SMALL, tiny
 
@@ -65,16 +64,3 @@ def test_an_action_that_is_ignored_stays_as_it_was() -> None:
     ignored = np.full_like(action, np.nan)  # both elements begin anew
     env.step(ignored)
     assert (action == 0.5).all() and np.isnan(ignored).all()
-
-
-@pytest.mark.parametrize("backend", ["eager", "native"])
-def test_an_evaluation_without_gradients_leaves_later_ones_whole(backend: str) -> None:
-    env = tiny("obstacle", 1, backend=backend, resolution=7)
-    drive = torch.full((1, *env.action_shape), 0.5)
-    with torch.inference_mode():
-        env.reset(seed=0)
-        env.step(drive)
-    env.reset(seed=0)
-    drive.requires_grad_()
-    env.step(drive)[1].sum().backward()
-    assert drive.grad.isfinite().all() and drive.grad.abs().max() > 0

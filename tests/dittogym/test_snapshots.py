@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, stir, tiny
+from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, stir, tiny
 
 from dittogym import TorchEnv, make_spec
 from dittogym.snapshots import Snapshot
@@ -27,12 +27,13 @@ def go_on(env: TorchEnv, drive: torch.Tensor) -> list[Any]:
     return [(env.step(action), everything(env)) for action in drive]
 
 
+@pytest.mark.parametrize("conditions", [None, {**vars(ALL), "latency": 2}], ids=["plain", "conditions"])
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @torch.no_grad()
-def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str, tmp_path) -> None:
+def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str, conditions: Any, tmp_path) -> None:
     """In the same environment, after more steps and a reset; through a file in a new one; and in one elsewhere."""
-    env, elsewhere = (tiny(task, 2, dtype=dtype, substeps=10) for _ in range(2))
+    env, new, elsewhere = (tiny(task, 2, dtype=dtype, substeps=10, conditions=conditions) for _ in range(3))
     env.reset(seed=4)
     stir(env)
     drive = actions(env, 2 + STEPS)
@@ -40,14 +41,18 @@ def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str, tmp_pat
         seen = env.step(action)[0]
     moment = env.save()
     future = go_on(env, drive[2:])
+    env.reset()
+    following = dict(env.env_state.conditions)
     env.reset(seed=9)
     elsewhere.reset(seed=30)
     elsewhere.step(drive[0])
     torch.save(moment, tmp_path / "moment.pt")
     read = torch.load(tmp_path / "moment.pt", weights_only=True)
-    for other, given in ((env, moment), (tiny(task, 2, dtype=dtype, substeps=10), read), (elsewhere, moment)):
+    for other, given in ((env, moment), (new, read), (elsewhere, moment)):
         assert torch.equal(other.load(given), seen)
         assert_same_bits(go_on(other, drive[2:]), future)
+        other.reset()
+        assert_same_bits(dict(other.env_state.conditions), following)
 
 
 @pytest.mark.parametrize("mode", [None, "SameStep", "NextStep", "Disabled"])
@@ -105,10 +110,10 @@ def test_one_moment_into_every_element() -> None:
     assert not torch.equal(batch.state.x[0], batch.state.x[1])
 
 
-@pytest.mark.parametrize("task", ["grow", "run"])
+@pytest.mark.parametrize(("task", "conditions"), [("grow", None), ("run", None), ("run", ALL)])
 @torch.no_grad()
-def test_only_masked_elements_are_loaded(task: str) -> None:
-    env, twin = tiny(task, 3), tiny(task, 3)
+def test_only_masked_elements_are_loaded(task: str, conditions: Any) -> None:
+    env, twin = (tiny(task, 3, conditions=conditions) for _ in range(2))
     drive = actions(env, 4)
     for e in (env, twin):
         e.reset(seed=1)

@@ -11,14 +11,8 @@ from torch import Tensor
 from dittogym import TorchEnv
 from dittogym.core import EnvState, observe, soft_observation
 from dittogym.geometry import Box
-from dittogym.observation import (
-    RASTER,
-    box_fraction,
-    silhouette,
-    soft_silhouette,
-)
+from dittogym.observation import RASTER, box_fraction, silhouette, soft_silhouette
 from dittogym.rewards import features_of
-from torchmpm import ParticleState
 
 
 def stirred(task: str, **options: object) -> TorchEnv:
@@ -34,7 +28,7 @@ def stirred(task: str, **options: object) -> TorchEnv:
 def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
     """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
     state = env.env_state
-    particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
+    particles = replace(state.particles, x=x, v=v)
     com = features_of(particles, env.model.num_robot_particles).com
     origin = env.spec.window.origin(com)
     return replace(state, particles=particles, centre=com, origin=origin)

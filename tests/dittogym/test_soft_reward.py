@@ -14,7 +14,6 @@ from dittogym.core import EnvState, evaluate
 from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
-from torchmpm import ParticleState
 
 #: Tasks whose reward looks at velocities.
 WITH_SPEED = ("run", "kick", "dig", "obstacle", "slot")
@@ -32,9 +31,8 @@ def reward(env: TorchEnv, state: EnvState, soft: bool = False) -> Tensor:
 
 def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
     """The present moment of the environment with other positions and velocities."""
-    state = env.env_state
-    old = state.particles
-    return replace(state, particles=ParticleState(x, old.v if v is None else v, old.C, old.F, old.Jp))
+    particles = env.state
+    return replace(env.env_state, particles=replace(particles, x=x, v=particles.v if v is None else v))
 
 
 def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:

@@ -3,10 +3,11 @@
 import copy
 import pickle
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
-from tiny import TASKS, actions, set_particles, tiny
+from tiny import ALL, TASKS, actions, set_particles, tiny
 from torch import Tensor
 
 from dittogym import core
@@ -53,11 +54,14 @@ def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
     assert torch.equal(env.step(drive)[1], before)
 
 
+@pytest.mark.parametrize("conditions", [None, ALL])
 @pytest.mark.parametrize("backend", ["eager", "native"])
 @pytest.mark.parametrize("task", TASKS)
-def test_gradients_from_a_state_that_was_made_in_inference_mode(task: str, backend: str) -> None:
-    env, results = tiny(task, 2, backend=backend, substeps=2), []
-    for inference in (False, True):
+def test_gradients_from_a_state_that_was_made_in_inference_mode(task: str, backend: str, conditions: Any) -> None:
+    """And with constants that were first made there, of actions of a size that no other test has."""
+    results = []
+    for inference in (True, False):
+        env = tiny(task, 2, backend=backend, substeps=2, conditions=conditions, resolution=7)
         with torch.inference_mode(inference), torch.set_grad_enabled(False):
             env.reset(seed=0)
             env.step(actions(env, 1)[0])

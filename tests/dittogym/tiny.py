@@ -12,12 +12,27 @@ import numpy as np
 import torch
 
 import dittogym
-from torchmpm import ParticleState, tree
+from torchmpm import tree
 
 TASKS = tuple(dittogym.TASKS)
 #: Tasks whose window stays where it is.
 FIXED = tuple(task for task in TASKS if dittogym.make_spec(task).window.follow is None)
 SMALL = {"particles": 120, "substeps": 4}
+#: Every condition, with ranges for which each task has room.
+ALL = dittogym.Conditions(
+    latency=(0, 2),
+    action_noise=(0.0, 0.3),
+    action_dropout=(0.0, 0.5),
+    observation_dropout=(0.0, 0.5),
+    mu=(0.8, 1.2),
+    yield_stress=(0.5, 1.5),
+    gravity=(0.9, 1.1),
+    shift=0.01,
+    turn=5.0,
+    velocity=0.5,
+    chance=0.7,
+    grid=4,
+)
 
 
 def tiny(task: str | dittogym.TaskSpec, num_envs: int = 1, **options: Any) -> dittogym.TorchEnv:
@@ -60,8 +75,7 @@ def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
 
 def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:
     """Put other values in place of fields of the particles."""
-    own = {name: fields.get(name, getattr(env.state, name)) for name in ("x", "v", "C", "F", "Jp")}
-    env.env_state = replace(env.env_state, particles=ParticleState(**own))
+    env.env_state = replace(env.env_state, particles=replace(env.state, **fields))
 
 
 def forget(function: Callable[..., Any]) -> None:

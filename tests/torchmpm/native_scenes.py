@@ -53,6 +53,22 @@ def solvers(count: int, batch: int) -> dict[str, Solver]:
 NAMES = tuple(solvers(3, 1))
 
 
+def lost(count: int, y: float) -> ParticleState:
+    """Particles of which the fourth is at this height."""
+    state = lively(count)
+    x = state.x.clone()
+    x[:, 3, 1] = y
+    return replace(state, x=x)
+
+
+def assert_lost_alone(native: ParticleState, eager: ParticleState, start: ParticleState, tolerance: float) -> None:
+    """Above and below the window, and at no place, the fourth particle keeps what it has; the others move as ever."""
+    others = [k for k in range(start.num_particles) if k != 3]
+    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=tolerance)
+    for result in (native, eager):
+        assert torch.equal(result.v[:, 3].cpu(), start.v[:, 3])
+
+
 def moving(count: int, batch: int) -> tuple[ParticleState, Tensor, Tensor]:
     """State, actuation and window origins; some particles are outside or leave, some inverted, Jp is not one."""
     state = lively(count, batch, strain=0.15)

@@ -95,6 +95,14 @@ def assert_close(first: ParticleState, second: ParticleState, tolerance: float) 
         assert error <= tolerance, f"{name} differs by {error:.2e} of its largest number"
 
 
+def assert_as_precise(native: ParticleState, eager: ParticleState, exact: ParticleState) -> None:
+    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
+    for name in ("x", "v", "C", "F", "Jp"):
+        true = getattr(exact, name)
+        mine, plain = ((getattr(state, name).double() - true).norm() for state in (native, eager))
+        assert mine <= 3.0 * plain + 1e-6 * true.norm(), name
+
+
 def assert_identical(first: ParticleState, second: ParticleState) -> None:
     """Compare all fields bit by bit."""
     for name in ("x", "v", "C", "F", "Jp"):

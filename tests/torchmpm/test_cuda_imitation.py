@@ -12,9 +12,17 @@ from dataclasses import replace
 import pytest
 import torch
 from cuda_imitation import Broken, Gpu, Imitation, Plan, Threads
-from native_scenes import NAMES, moving, solvers
-from scenes import assert_close, assert_identical, lively, normal, robot
-from test_native_adjoint import assert_gradients_close, gradients, state_leaves, value_leaves, varied
+from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
+from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
+from test_native_adjoint import (
+    assert_broken_alone,
+    assert_gradients_close,
+    compare_gradients,
+    gradients,
+    state_leaves,
+    value_leaves,
+    varied,
+)
 from torch import Tensor
 
 from torchmpm import Grid, ParticleState, Solver
@@ -65,17 +73,13 @@ def test_equals_eager(name: str, plan: Plan, use: Callable[..., None]) -> None:
 @every_plan
 @pytest.mark.parametrize("name", NAMES)
 def test_single_precision(name: str, plan: Plan, use: Callable[..., None]) -> None:
-    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
     state, field, origin = moving(COUNT, 2)
     solver = solvers(COUNT, 2)[name]
     exact = step(solver, "eager", state, field, substeps=20, origin=origin)
     use(plan)
     single = state.to(torch.float32), field.float()
     native, plain = (step(solver, b, *single, substeps=20, origin=origin.float()) for b in ("native", "eager"))
-    for field_name in ("x", "v", "C", "F", "Jp"):
-        true = getattr(exact, field_name)
-        mine, its = ((getattr(s, field_name).double() - true).norm() for s in (native, plain))
-        assert mine <= 3.0 * its + 1e-6 * true.norm(), field_name
+    assert_as_precise(native, plain, exact)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -97,10 +101,7 @@ def test_order_of_threads_makes_no_difference(plan: Plan, dtype: torch.dtype, us
 def test_gradients_in_state_actuation_and_origin(name: str, plan: Plan, use: Callable[..., None]) -> None:
     given = state_leaves(COUNT, 3)
     use(plan)
-    found, expected = (
-        gradients(lambda _: solvers(COUNT, 3)[name], given, tuple(given), 6, b) for b in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-10)
+    compare_gradients(lambda _: solvers(COUNT, 3)[name], given, tuple(given), 6, 1e-10)
 
 
 @every_plan
@@ -108,10 +109,7 @@ def test_gradients_in_values(plan: Plan, use: Callable[..., None]) -> None:
     """Of every material, in every shape; masses, volumes and gravity too."""
     given, wanted = state_leaves(COUNT, 2) | value_leaves(COUNT, 2), tuple(value_leaves(3, 1))
     use(plan)
-    found, expected = (
-        gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 5, b) for b in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-9)
+    compare_gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 5, 1e-9)
 
 
 @every_plan
@@ -138,9 +136,7 @@ def test_a_window_follows_fast_robots(use: Callable[..., None]) -> None:
     assert_close(native, eager, 1e-11)
     leaves = {"x": state.x, "v": state.v, "C": state.C, "F": state.F, "Jp": state.Jp, "actuation": field}
     leaves["origin"] = torch.zeros(3, 2, dtype=torch.float64)
-    wanted = ("F", "actuation", "origin")
-    found, expected = (gradients(lambda _: solver, leaves, wanted, 25, b) for b in ("native", "eager"))
-    assert_gradients_close(found, expected, 1e-9)
+    compare_gradients(lambda _: solver, leaves, ("F", "actuation", "origin"), 25, 1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64])
@@ -171,25 +167,16 @@ def test_without_muscles(use: Callable[..., None]) -> None:
     use(Plan(muscles=False))
     native, eager = (step(solver, b, lively(COUNT, 2), substeps=4) for b in ("native", "eager"))
     assert_close(native, eager, 1e-12)
-    found, expected = (
-        gradients(lambda _: replace(solver, bodies=(replace(solver.bodies[0], muscle=False),)), given, ("x",), 3, b)
-        for b in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-10)
+    passive = replace(solver, bodies=(replace(solver.bodies[0], muscle=False),))
+    compare_gradients(lambda _: passive, given, ("x",), 3, 1e-10)
 
 
 @pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float, use: Callable[..., None]) -> None:
-    """Above and below the window, and at no place, particles keep what they have."""
-    state = lively(10)
-    x = state.x.clone()
-    x[:, 3, 1] = y
     for plan in (Plan(window=(16, 14), muscles=False), Plan(shared=False, team=2, muscles=False)):
         use(plan)
-        native, eager = (step(robot(10, rules=()), b, replace(state, x=x), substeps=2) for b in ("native", "eager"))
-        others = [k for k in range(10) if k != 3]
-        torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
-        assert torch.equal(native.v[:, 3], state.v[:, 3])
+        native, eager = (step(robot(10, rules=()), b, lost(10, y), substeps=2) for b in ("native", "eager"))
+        assert_lost_alone(native, eager, lost(10, y), 1e-13)
 
 
 @pytest.mark.parametrize("corner", [(0.0, -0.1), (0.75, 0.8), (-0.2, 0.4)])
@@ -198,10 +185,7 @@ def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None
     given = state_leaves(COUNT, 2) | {"x": lively(COUNT, 2, corner=corner).x}
     for plan in (Plan(), Plan(window=(12, 12)), Plan(shared=False, team=2)):
         use(plan)
-        found, expected = (
-            gradients(lambda _: robot(COUNT, rules=()), given, tuple(given), 4, b) for b in ("native", "eager")
-        )
-        assert_gradients_close(found, expected, 1e-9)
+        compare_gradients(lambda _: robot(COUNT, rules=()), given, tuple(given), 4, 1e-9)
 
 
 @pytest.mark.parametrize("name", ["x", "v", "F", "actuation"])
@@ -210,19 +194,8 @@ def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None
 def test_a_broken_robot_harms_no_other(name: str, value: float, dtype: torch.dtype, use: Callable[..., None]) -> None:
     given = {key: t.to(dtype) for key, t in state_leaves(15, 3).items()}
     given[name][1].view(-1)[::5] = value
-    ends = []
-    for chosen in ([0, 1, 2], [0, 2]):
-        use(Plan(team=2, teams=1))
-        leaves = {key: t[chosen].requires_grad_() for key, t in given.items()}
-        state = ParticleState(*(leaves[n] for n in ("x", "v", "C", "F", "Jp")))
-        solver = solvers(15, 1)["three bodies"]
-        final = step(solver, "native", state, leaves["actuation"], substeps=3, origin=leaves["origin"])
-        loss = final.x[[0, -1]].sum() + final.F[[0, -1]].square().sum()
-        ends.append((final.detach()[[0, -1]], torch.autograd.grad(loss, list(leaves.values()))))
-    (together, of_all), (apart, of_some) = ends
-    assert_identical(together, apart)
-    for one, other in zip(of_all, of_some, strict=True):
-        torch.testing.assert_close(one[[0, 2]], other, rtol=0, atol=1e-5 * other.abs().max().item())
+    use(Plan(team=2, teams=1))
+    assert_broken_alone(replace(solvers(15, 1)["three bodies"], backend="native"), given, 1e-5)
 
 
 def test_not_a_number_spreads_as_on_the_cpu(use: Callable[..., None]) -> None:

@@ -11,12 +11,14 @@ from dataclasses import replace
 import pytest
 import torch
 from cuda_drivers import Imitation, in_use
-from native_scenes import NAMES, RULES, moving, solvers
+from native_scenes import NAMES, RULES, assert_lost_alone, lost, moving, solvers
 from scenes import assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
     STATE,
     Leaves,
+    assert_broken_alone,
     assert_gradients_close,
+    compare_gradients,
     corner_leaves,
     gradients,
     state_leaves,
@@ -58,9 +60,7 @@ def both_gradients(
 ) -> None:
     """Compare the derivatives of the native and of the eager backend."""
     given = {name: value.to(device) for name, value in given.items()}
-    found, expected = (gradients(solver, given, wanted, substeps, name) for name in ("native", "eager"))
-    assert all(value.isfinite().all() for value in found.values())
-    assert_gradients_close(found, expected, 1e-8)
+    expected = compare_gradients(solver, given, wanted, substeps, 1e-8)
     assert expected[wanted[0]].abs().max() > 0
 
 
@@ -161,14 +161,7 @@ def test_window_of_another_size_and_spacing(device: str) -> None:
 @on_a_gpu
 @pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float, device: str) -> None:
-    """Above and below the window, and at no place, particles keep what they have."""
-    state = lively(10)
-    x = state.x.clone()
-    x[:, 3, 1] = y
-    native, eager = both(robot(10, rules=()), device, replace(state, x=x), substeps=2)
-    others = [k for k in range(10) if k != 3]
-    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-10)
-    assert torch.equal(native.v[:, 3].cpu(), state.v[:, 3])
+    assert_lost_alone(*both(robot(10, rules=()), device, lost(10, y), substeps=2), lost(10, y), 1e-10)
 
 
 @on_a_gpu
@@ -177,18 +170,8 @@ def test_positions_no_address_exists_for(y: float, device: str) -> None:
 def test_a_broken_element_harms_no_other(name: str, value: float, device: str) -> None:
     given = state_leaves(15, 3)
     given[name][1].view(-1)[::5] = value
-    given = {key: t.to(device).requires_grad_() for key, t in given.items()}
-    solver, ends = replace(solvers(15, 1)["von Mises"], backend="native"), []
-    for chosen in (slice(None), [0, 2]):
-        leaves = {key: t[chosen] for key, t in given.items()}
-        state = ParticleState(*(leaves[n] for n in STATE))
-        final = solver.step(state, leaves["actuation"], substeps=3, origin=leaves["origin"])
-        final = final[[0, 2]] if chosen == slice(None) else final
-        ends.append((final, torch.autograd.grad(final.x.sum() + final.F.square().sum(), list(given.values()))))
-    (together, of_all), (apart, of_some) = ends
-    assert_identical(together, apart)
-    for one, other in zip(of_all, of_some, strict=True):
-        torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=0, atol=1e-9 * other.abs().max().item())
+    solver = replace(solvers(15, 1)["von Mises"], backend="native")
+    assert_broken_alone(solver, {key: t.to(device) for key, t in given.items()}, 1e-9)
 
 
 @pytest.mark.parametrize("count", [30, 60])

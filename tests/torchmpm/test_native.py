@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from native_scenes import NAMES, moving, solvers
-from scenes import assert_close, assert_identical, lively, normal, robot
+from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
+from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
@@ -41,16 +41,12 @@ def test_equals_eager(name: str, batch: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_single_precision(name: str) -> None:
-    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
     state, field, origin = moving(COUNT, 2)
     solver = solvers(COUNT, 2)[name]
     exact = replace(solver, backend="eager").step(state, field, substeps=20, origin=origin)
     native, eager = both(solver, state.to(torch.float32), field.float(), substeps=20, origin=origin.float())
     assert native.dtype == torch.float32
-    for field_name in ("x", "v", "C", "F", "Jp"):
-        true = getattr(exact, field_name)
-        mine, plain = ((getattr(s, field_name).double() - true).norm() for s in (native, eager))
-        assert mine <= 3.0 * plain + 1e-6 * true.norm(), field_name
+    assert_as_precise(native, eager, exact)
 
 
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (2, 1), (1, 63), (1, 64), (3, 65), (1, 2500), (2, 9000)])
@@ -110,15 +106,7 @@ def test_a_constant_is_the_same_in_every_form(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("y", [math.nan, math.inf, -math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float) -> None:
-    """Above and below the window, and at no place, particles keep what they have."""
-    state = lively(20)
-    x = state.x.clone()
-    x[:, 3, 1] = y
-    native, eager = both(robot(20, rules=()), replace(state, x=x), substeps=3)
-    others = [k for k in range(20) if k != 3]
-    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
-    for result in (native, eager):
-        assert torch.equal(result.v[:, 3], state.v[:, 3])
+    assert_lost_alone(*both(robot(20, rules=()), lost(20, y), substeps=3), lost(20, y), 1e-13)
 
 
 def test_what_the_kernels_do_not_support_is_named() -> None:

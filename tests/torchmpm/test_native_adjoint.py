@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import combination, lively, normal, robot
+from scenes import assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -93,36 +93,50 @@ def assert_gradients_close(found: Leaves, expected: Leaves, tolerance: float) ->
         assert error <= tolerance, f"{name} differs by {error:.1e}"
 
 
+def compare_gradients(
+    solver: Callable[[Leaves], Solver], given: Leaves, wanted: tuple[str, ...], substeps: int, tolerance: float
+) -> Leaves:
+    """Those of the native backend with those of the eager one, which are returned."""
+    found, expected = (gradients(solver, given, wanted, substeps, backend) for backend in ("native", "eager"))
+    assert all(value.isfinite().all() for value in found.values())
+    assert_gradients_close(found, expected, tolerance)
+    return expected
+
+
+def assert_broken_alone(solver: Solver, given: Leaves, tolerance: float) -> None:
+    """The second of three robots harms no other: with and without it they have the same states and derivatives."""
+    ends = []
+    for chosen in ([0, 1, 2], [0, 2]):
+        leaves = {name: value[chosen].requires_grad_() for name, value in given.items()}
+        start = ParticleState(*(leaves[name] for name in STATE))
+        final = solver.step(start, leaves["actuation"], substeps=3, origin=leaves["origin"])[[0, -1]]
+        found = torch.autograd.grad(final.x.sum() + final.F.square().sum(), list(leaves.values()))
+        ends.append((final.detach(), {name: value[[0, -1]] for name, value in zip(leaves, found, strict=True)}))
+    (together, of_all), (apart, of_some) = ends
+    assert_identical(together, apart)
+    assert_gradients_close(of_all, of_some, tolerance)
+
+
 @pytest.mark.parametrize("substeps", [1, 25])
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("name", NAMES)
 def test_in_state_actuation_and_origin(name: str, batch: int, substeps: int) -> None:
     given = state_leaves(COUNT, batch)
-    found, expected = (
-        gradients(lambda _: solvers(COUNT, batch)[name], given, tuple(given), substeps, backend)
-        for backend in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-10)
+    expected = compare_gradients(lambda _: solvers(COUNT, batch)[name], given, tuple(given), substeps, 1e-10)
     assert expected["x"].abs().max() > 0
 
 
 @pytest.mark.parametrize("batch", [1, 2])
 def test_in_values(batch: int) -> None:
     given, wanted = state_leaves(COUNT, batch) | value_leaves(COUNT, batch), tuple(value_leaves(3, 1))
-    found, expected = (
-        gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 25, backend) for backend in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-9)
+    expected = compare_gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 25, 1e-9)
     assert all(value.abs().max() > 0 for value in expected.values()), "every value must matter in this scene"
 
 
 @pytest.mark.parametrize("wanted", ["actuation", "mu", "gravity", "x", "origin"])
 def test_in_one_thing_alone(wanted: str) -> None:
     given = state_leaves(60, 2) | value_leaves(60, 2)
-    found, expected = (
-        gradients(lambda leaves: varied(60, leaves), given, (wanted,), 5, backend) for backend in ("native", "eager")
-    )
-    assert_gradients_close(found, expected, 1e-10)
+    compare_gradients(lambda leaves: varied(60, leaves), given, (wanted,), 5, 1e-10)
 
 
 @pytest.mark.parametrize("name", ["von Mises", "elastic"])
@@ -149,11 +163,7 @@ def corner_leaves() -> Leaves:
 @pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Snow(800.0, 500.0)])
 def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) -> None:
     solver = robot(12, bodies=(Body(12, material, muscle=True),))
-    found, expected = (
-        gradients(lambda _: solver, corner_leaves(), STATE, 1, backend) for backend in ("native", "eager")
-    )
-    assert all(value.isfinite().all() for value in found.values())
-    assert_gradients_close(found, expected, 1e-10)
+    compare_gradients(lambda _: solver, corner_leaves(), STATE, 1, 1e-10)
 
 
 def test_friction_that_just_stops_a_node_has_the_derivative_of_sliding() -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from scenes import assert_identical, lively, robot
 
-from torchmpm.backends import compiler_found
+from torchmpm.backends import compiler_found, warn_eager
 from torchmpm.native import library
 
 
@@ -99,14 +99,20 @@ def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
 
 
-@pytest.mark.parametrize("prevent", [no_interpreter, no_program, no_folder])
+def no_success(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CXX", "false")
+
+
+@pytest.mark.parametrize("prevent", [no_interpreter, no_program, no_folder, no_success])
 def test_what_cannot_be_built_runs_eagerly(
-    prevent: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    prevent: Callable[..., None], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    """A compiler that cannot be started, or file systems that cannot be written."""
+    """And says why: a compiler that cannot be started or fails, or file systems that cannot be written."""
     prevent(monkeypatch, tmp_path)
+    warn_eager.cache_clear()
     monkeypatch.setattr(library, "family", lambda: None)
     assert_identical(*(robot(5, backend=name).step(lively(5)) for name in ("auto", "eager")))
+    assert "could not be built" in caplog.text
     with pytest.raises(ValueError, match="backend 'native' could not be built"):
         library.load(torch.float32)
 
