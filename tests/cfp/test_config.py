@@ -104,10 +104,7 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
         ({"resolutions": 8}, "resolutions must be of type"),
         ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
         ({"target": 3}, "target must be of type str | None"),
-        ({"tau": 10**400}, r"tau must be below 2\*\*63"),
         ({"gate_bias": [10**400]}, r"gate_bias must be below 2\*\*63"),
-        ({"colour": 1}, "colour is not an option"),
-        ({"environment": {"particles": 3}}, "environment is not an option"),
     ],
 )
 def test_value_of_another_type_is_named(values, message):
@@ -125,12 +122,9 @@ def test_json_values_take_the_types_of_their_fields():
     ("values", "message"),
     [
         ({"steps": 0}, "steps must be at least 1, got 0"),
-        ({"seed": -1}, "seed must be between"),
         ({"num_envs": 10_001}, "num_envs must be at most 10000"),
-        ({"alpha": [float("nan")]}, "alpha must be finite"),
         ({"alpha": []}, "alpha must have at least one value"),
         ({"resolutions": []}, "resolutions must have at least one value"),
-        ({"resolutions": [8, 7]}, "resolutions must be increasing values"),
         ({"resolutions": [4, 8, 16]}, "handover must have 2 values"),
         ({"handover": [1.0]}, "handover must be shares of the steps between 0 and 1"),
         ({"resolutions": [4, 8, 16], "handover": [0.5, 0.4]}, "steps and handover must give every stage"),
@@ -147,8 +141,6 @@ def test_json_values_take_the_types_of_their_fields():
         ({"algo": "cfp-analytic", "action_step": [0.0]}, "action_step must be positive, got 0"),
         ({"algo": "cfp-analytic", "weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
         ({"algo": "cfp-analytic", "num_layouts": 9_999}, "num_layouts must be at most 9992"),
-        ({"algo": "cfp-analytic", "resample": True}, "resample must be False for cfp-analytic"),
-        ({"vary_noise": 0.5}, "vary_noise requires vary"),
         ({"algo": "cfp-analytic", "vary_start": 0.0}, "vary_start requires vary"),
         ({"algo": "cfp-analytic", "train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
     ],
