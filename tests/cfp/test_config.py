@@ -142,6 +142,13 @@ def test_json_values_take_the_types_of_their_fields():
         ({"algo": "cfp-analytic", "weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
         ({"algo": "cfp-analytic", "num_layouts": 9_999}, "num_layouts must be at most 9992"),
         ({"algo": "cfp-analytic", "vary_start": 0.0}, "vary_start requires vary"),
+        ({"vary": 1.5}, "vary must be between 0 and 1, got 1.5"),
+        ({"vary_latency": -1}, "vary_latency must be at least 0, got -1"),
+        ({"vary_noise": -0.1}, "vary_noise must be at least 0, got -0.1"),
+        ({"vary_actions": 1.1}, "vary_actions must be between 0 and 1, got 1.1"),
+        ({"vary_pixels": -0.1}, "vary_pixels must be between 0 and 1, got -0.1"),
+        ({"vary_physics": 1.0}, "vary_physics must be at least 0 and less than 1, got 1.0"),
+        ({"vary_start": -1.0}, "vary_start must be at least 0, got -1.0"),
         ({"algo": "cfp-analytic", "train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
     ],
 )
