@@ -574,11 +574,8 @@ def of_stage(values: tuple[Value, ...], stage: int) -> Value:
 def check_training_seeds(name: str, count: int, before: int = 0, stages: int = 1) -> None:
     """Check that none of the initial positions of training belongs to evaluations.
 
-    Args:
-        name: Name of an option.
-        count: Its value, the number of initial positions in a stage.
-        before: How many others precede them.
-        stages: Stages with initial positions of their own.
+    ``name`` is the option whose value is ``count``, the number of initial positions in a stage; ``before`` others
+    precede them, and each of the ``stages`` has positions of its own.
     """
     largest = (EVALUATION_SEED - before) // stages
     if count > largest:
