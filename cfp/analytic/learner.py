@@ -142,7 +142,11 @@ class Regression(Resumable):
         self.adam = make_adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
 
     def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> tuple[Tensor, Tensor]:
-        """Take one step of Adam towards the ``locations`` for ``images``; returns loss and norm, for `check_norms`."""
+        """Take one step of Adam towards the ``locations`` of actions for ``images``.
+
+        Returns:
+            The mean squared error, and the norm of its gradient, for `check_norms`.
+        """
         self.adam.param_groups[0]["lr"] = learning_rate
         self.adam.zero_grad()
         loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)

@@ -311,9 +311,13 @@ def evaluate(
 ) -> list[Result]:
     """Evaluate policies without learning; torch's generator is left as it was.
 
-    A trial gives the same result whatever the number of threads and whatever is evaluated beside it. There is a
-    progress bar, of this ``name``, if the ``steps`` that an episode has at most are given. Once ``should_stop``, which
-    is asked before each step, is true, the evaluation ends in `EpisodesStopped`.
+    A trial gives the same result whatever the number of threads and whatever is evaluated beside it.
+
+    Args:
+        trials: Episodes, all played side by side.
+        steps: Steps of an episode at most, to show a progress bar; None shows none.
+        should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
+        name: What the progress bar is called.
     """
     spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
