@@ -284,11 +284,11 @@ class StagedConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VariationConfig(StagedConfig):
-    """Conditions that differ between training episodes (domain randomisation; Tobin et al., IROS 2017).
+class CoarseToFineConfig(StagedConfig):
+    """A run of the coarse-to-fine policy, which may begin with a trained one.
 
-    Evaluations in training, which choose the policy, take place under such conditions too, the table at the end under
-    the task's own.
+    The conditions of training episodes may differ (domain randomisation; Tobin et al., IROS 2017). Evaluations in
+    training, which choose the policy, take place under such conditions too, the table at the end under the task's own.
     """
 
     vary: float = 0.0
@@ -305,9 +305,13 @@ class VariationConfig(StagedConfig):
     """Relative change of mu, yield stress and gravity, at most."""
     vary_start: float = 1.0
     """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
+    start_from: str | None = None
+    """Policy to begin after: a run folder, a file, the name of one that comes with the package, or hf://OWNER/NAME."""
+    refine: bool = False
+    """Continue to train the last stage of start_from instead."""
 
     def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
+        """Those of training episodes of a ``stage`` and of evaluations that choose the policy; None: the task's own."""
         if not self.vary:
             return None
         factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
@@ -332,24 +336,10 @@ class VariationConfig(StagedConfig):
         check_at_least(0, vary_latency=self.vary_latency, vary_noise=self.vary_noise, vary_start=self.vary_start)
         check_fraction(vary=self.vary, vary_actions=self.vary_actions, vary_pixels=self.vary_pixels)
         check_below_one(vary_physics=self.vary_physics)
-        for option in dataclasses.fields(VariationConfig):
+        for option in dataclasses.fields(CoarseToFineConfig):
             given = getattr(self, option.name)
             if not self.vary and option.name.startswith("vary_") and given != option.default:
                 raise ConfigError(f"{option.name} requires vary, the probability with which it applies, got {given}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CoarseToFineConfig(VariationConfig):
-    """A run of the coarse-to-fine policy, which may begin with a trained one."""
-
-    start_from: str | None = None
-    """Policy to begin after: a run folder, a file, the name of one that comes with the package, or hf://OWNER/NAME."""
-    refine: bool = False
-    """Continue to train the last stage of start_from instead."""
-
-    def check(self) -> None:
-        """Check what the types do not express."""
-        super().check()
         if self.refine and self.start_from is None:
             raise ConfigError("refine requires start_from, which names the policy")
 
@@ -584,11 +574,8 @@ def of_stage(values: tuple[Value, ...], stage: int) -> Value:
 def check_training_seeds(name: str, count: int, before: int = 0, stages: int = 1) -> None:
     """Check that none of the initial positions of training belongs to evaluations.
 
-    Args:
-        name: Name of an option.
-        count: Its value, the number of initial positions in a stage.
-        before: How many others precede them.
-        stages: Stages with initial positions of their own.
+    ``name`` is the option whose value is ``count``, the number of initial positions in a stage; ``before`` others
+    precede them, and each of the ``stages`` has positions of its own.
     """
     largest = (EVALUATION_SEED - before) // stages
     if count > largest:

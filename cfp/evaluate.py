@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -30,20 +30,6 @@ EXAMPLES = (
     "runs/run --noise both --replay run.html",
     "runs/run --episodes 20 --record run.npz",
 )
-
-
-@dataclass(frozen=True)
-class FilmOptions:
-    """How the video looks."""
-
-    size: int = 512
-    """Pixels per side of the video."""
-    rate: float = 30.0
-    """Pictures per second of the video."""
-    speed: float | None = None
-    """Playback speed, 1 is real time; None: real time, or slower for episodes of less than four seconds."""
-    zoom: float | None = None
-    """The video shows 1/zoom metres; None: 0.56 m."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +66,14 @@ class Command:
     """Also write its episodes to a file .npz: observations, actions, rewards, ends and particles."""
     record_fields: tuple[Literal["x", "v", "C", "F", "Jp"], ...] = ("x", "v")
     """Fields of the particles in that file: x, v, C, F and Jp are the whole state."""
-    film: tyro.conf.OmitArgPrefixes[FilmOptions] = field(default_factory=FilmOptions)
+    size: int = 512
+    """Pixels per side of the video."""
+    rate: float = 30.0
+    """Pictures per second of the video."""
+    speed: float | None = None
+    """Playback speed, 1 is real time; None: real time, or slower for episodes of less than four seconds."""
+    zoom: float | None = None
+    """The video shows 1/zoom metres; None: 0.56 m."""
 
     def open(self) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
@@ -142,8 +135,9 @@ def open_policy(path: str, device: str, seed: int | None) -> tuple[RunConfig, di
 def run(command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
     check_at_least(1, episodes=command.episodes)
-    files, usual = {"video": command.video, "replay": command.replay}, vars(FilmOptions())
-    options = {name: value for name, value in vars(command.film).items() if value != usual[name]}
+    files = {"video": command.video, "replay": command.replay}
+    films = {name: getattr(command, name) for name in ("size", "rate", "speed", "zoom")}
+    options = {name: value for name, value in films.items() if value != getattr(Command, name)}
     check_files(files, options)
     if command.record is not None and command.record.suffix != ".npz":
         raise ConfigError(f"record must end in .npz, got {command.record}")

@@ -387,19 +387,12 @@ class Trunk(nn.Module):
 
 
 class Outputs(NamedTuple):
-    """What an actor's networks make of observations, before noise, tanh and composition.
+    """What an actor's networks make of observations, before noise, tanh and composition."""
 
-    Attributes:
-        mean: (B, 2, R, R), before tanh.
-        raw_std: (B, 2, R, R), see `standard_deviation`.
-        gate_logit: (B, 2, R, R) before `ActorSpec.gate_bias`, or None for a plain actor.
-        coarse: Sample of the coarser actor, or None for a plain actor.
-    """
-
-    mean: Tensor
-    raw_std: Tensor
-    gate_logit: Tensor | None = None
-    coarse: Sample | None = None
+    mean: Tensor  # (B, 2, R, R), before tanh
+    raw_std: Tensor  # (B, 2, R, R), see `standard_deviation`
+    gate_logit: Tensor | None = None  # (B, 2, R, R) before `ActorSpec.gate_bias`; None for a plain actor
+    coarse: Sample | None = None  # of the coarser actor; None for a plain actor
 
     @property
     def location(self) -> Tensor:

@@ -74,7 +74,7 @@ class ReplayArchive:
 
     def _write(self, buffer: ReplayBuffer, chunk: Chunk) -> None:
         index = np.arange(chunk.start, chunk.stop) % buffer.buffer_size
-        arrays = {name: _as_array(getattr(buffer, name)[index]) for name in FIELDS}
+        arrays = {name: torch.as_tensor(getattr(buffer, name)[index]).cpu().numpy() for name in FIELDS}
         write_atomically(self.folder / chunk.file, lambda file: _write_arrays(file, arrays))
 
     def prune(self) -> None:
@@ -105,10 +105,6 @@ class ReplayArchive:
             raise CheckpointError(f"{self.folder}: rows {stop} to {rows} of the replay buffer are missing")
         buffer.pos = rows % buffer.buffer_size
         buffer.full = rows >= buffer.buffer_size
-
-
-def _as_array(rows: np.ndarray | Tensor) -> np.ndarray:
-    return rows.cpu().numpy() if isinstance(rows, Tensor) else rows
 
 
 def _write_arrays(file: BinaryIO, arrays: dict[str, np.ndarray]) -> None:

@@ -27,19 +27,12 @@ Direction: TypeAlias = Literal["left", "right", "up", "down"]
 
 @dataclass(frozen=True)
 class Grip:
-    """Particles that are pulled at.
+    """Particles that are pulled at."""
 
-    Attributes:
-        indices: (n,) of the particles held.
-        weights: (n, 1), from 0 to 1.
-        offset: (2,), m, from their weighted centre to the place at which they are held.
-        hanging: Indices of the particles that move along: all of the robot, or of other matter only what is held.
-    """
-
-    indices: Tensor
-    weights: Tensor
-    offset: Tensor
-    hanging: Tensor
+    indices: Tensor  # (n,) of the particles held
+    weights: Tensor  # (n, 1), from 0 to 1
+    offset: Tensor  # (2,), m, from their weighted centre to the place at which they are held
+    hanging: Tensor  # indices of what moves along: all of the robot, or of other matter only what is held
 
     @classmethod
     def take(cls, state: ParticleState, point: Tensor, num_robot: int) -> Grip | None:

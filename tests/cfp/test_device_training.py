@@ -22,6 +22,7 @@ from cfp.analytic.critic import Critic, mlp
 from cfp.analytic.learner import ImageMemory, Regression
 from cfp.analytic.window import Window
 from cfp.config import Hyperparameters, WindowConfig, to_words
+from cfp.envs import make as envs
 from cfp.envs.vec_env import TorchVecEnv, monitored
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.checkpoint import ReplayArchive
@@ -181,6 +182,23 @@ def test_windows_that_do_not_fit_on_a_gpu_are_refused(monkeypatch):
 
 
 # Options.
+
+
+@pytest.mark.parametrize(
+    ("gpu", "reason", "device"), [(False, None, "cpu"), (True, None, "cuda"), (True, "it has 7.5", "cpu")]
+)
+def test_auto_is_a_gpu_that_the_kernels_run_on(monkeypatch, caplog, gpu, reason, device):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(envs, "kernels_fail", lambda device: reason)
+    envs._automatic_device.cache_clear()
+    assert envs.choose_device("auto") == envs.choose_device("auto") == device
+    envs._automatic_device.cache_clear()
+    said = [record.message for record in caplog.records]
+    assert said == (
+        [] if reason is None else [f"device auto is the CPU, because the physics would be slow on the GPU: {reason}"]
+    )
+    assert envs.choose_device("cpu") == "cpu"
 
 
 @pytest.mark.parametrize("make", [sac_preset, analytic_preset])

@@ -165,29 +165,26 @@ def test_policies_with_parity_in_their_header_load(tmp_path, environment, layout
 
 
 @pytest.mark.parametrize(
-    ("task", "option", "one", "other", "same"),
+    ("task", "own", "here", "differs"),
     [
-        ("slot", "variant", None, "registered", True),
-        ("slot", "variant", None, "published", False),
-        ("shapematch", "target", None, "star", True),
-        ("shapematch", "target", "M", "star", False),
+        ("slot", {"variant": None}, {"variant": "registered"}, None),  # the default of a task may be named or not
+        ("slot", {"variant": "registered"}, {"variant": None}, None),
+        ("slot", {"variant": None}, {"variant": "published"}, "variant"),
+        ("slot", {"variant": "published"}, {"variant": None}, "variant"),
+        ("shapematch", {"target": "star"}, {"target": None}, None),
+        ("shapematch", {"target": None}, {"target": "star"}, None),
+        ("shapematch", {"target": "M"}, {"target": "star"}, "target"),
+        ("shapematch", {"target": "star"}, {"target": "M"}, "target"),
+        ("run", {"substeps": 100}, {"dt": 2e-4}, None),
+        ("run", {"dt": 2e-4, "substeps": 50}, {}, None),
+        ("run", {"substeps": 50}, {}, "environment steps"),
     ],
 )
-def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
-    for given, wanted in ((one, other), (other, one)):
-        description = {"task": task, "environment": {option: given}}
-        with nullcontext() if same else pytest.raises(ConfigError, match=f"start_from .*{option}"):
-            check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
-
-
-def test_the_duration_of_a_step_must_be_that_of_the_training():
-    for own, here, fits in (
-        ({"substeps": 100}, {"dt": 2e-4}, True),
-        ({"dt": 2e-4, "substeps": 50}, {}, True),
-        ({"substeps": 50}, {}, False),
-    ):
-        with nullcontext() if fits else pytest.raises(ConfigError, match="teacher must be a policy for"):
-            check_trained_for("teacher", {"task": "run", "environment": own}, "run", EnvironmentConfig(**here))
+def test_task_and_duration_of_a_step_must_be_those_of_the_training(task, own, here, differs):
+    description, environment = {"task": task, "environment": own}, EnvironmentConfig(**here)
+    refused = pytest.raises(ConfigError, match=f"teacher must be a policy for .*{differs}")
+    with refused if differs else nullcontext():
+        check_trained_for("teacher", description, task, environment)
 
 
 @pytest.mark.parametrize(
