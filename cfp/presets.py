@@ -228,8 +228,8 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
     task, quick = paper.task, name == "quick"
     horizon, many = dittogym.make_spec(task).horizon, task in MANY_UPDATES
     quick_steps, quick_handover = 48_000 if many else 38_400, 0.75
-    # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. Two seeds
-    # of RUN gained nothing from more steps of the first stage.
+    # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. Three
+    # seeds of RUN gained nothing from more steps of the first stage.
     steps = quick_steps if quick else 320_000
     coarse = paper.resolutions[0]
     options: dict[str, Any] = {
