@@ -1,4 +1,4 @@
-"""Weights, addresses, scatter as the transpose of gather, and both transfers on affine velocity fields."""
+"""Weights, addresses, and both transfers on affine velocity fields."""
 
 import math
 
@@ -69,43 +69,6 @@ def test_scatter_of_one_particle_anywhere(axis: int, place: float) -> None:
                 expected[i, j] = weights[0][p] * weights[1][q]
     found = existing(scatter(nodes, nodes.weights[None]))[0, 0]
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * max(1.0, expected.abs().max().item()))
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_what_is_no_number_has_an_address_and_no_effect(axis: int, number: float) -> None:
-    u = [3.3, 3.3]
-    u[axis] = number
-    nodes = at(*(torch.tensor([[c]], dtype=torch.float64) for c in u))
-    assert 0 <= nodes.ids.min() and nodes.ids.max() < nodes.cells
-    assert torch.equal(existing(scatter(nodes, nodes.weights[None])), torch.zeros(1, 1, R, R, dtype=torch.float64))
-
-
-def test_origin_shifts_each_simulation() -> None:
-    u, v = torch.full((2, 1), 3.3, dtype=torch.float64), torch.full((2, 1), 4.4, dtype=torch.float64)
-    origin = torch.tensor([[0.0, 0.0], [GRID.h, -2 * GRID.h]], dtype=torch.float64)
-    nodes = stencil(GRID, GRID.h * u, GRID.h * v, origin)
-    first, second = nodes.ids.view(2, 3, 3)
-    assert torch.equal(second, first - GRID.width + 2)
-    torch.testing.assert_close(nodes.weights[1], nodes.weights[0], rtol=0, atol=1e-14)
-    moved = at(u, v, origin=(-3.7, 11.2))
-    assert torch.equal(moved.ids.view(2, 3, 3)[0], first)
-
-
-def scattered(seed: int, batch: int = 2, count: int = 30) -> Stencil:
-    """Stencils of particles all over the window and beyond its edges."""
-    spread = 3.5 + 3.0 * normal(2, batch, count, seed=seed)
-    return at(spread[0], spread[1])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_scatter_is_the_transpose_of_gather(seed: int) -> None:
-    nodes = scattered(seed)
-    values, field = normal(2, 2, 3, 3, 30, seed=seed + 10), normal(2, 2, nodes.cells, seed=seed + 20)
-    spread, read = scatter(nodes, values), gather(nodes, field)
-    assert spread.shape == field.shape
-    assert read.shape == values.shape
-    assert (spread * field).sum().item() == pytest.approx((values * read).sum().item(), rel=1e-12)
 
 
 def test_gradient_of_the_weights() -> None:
