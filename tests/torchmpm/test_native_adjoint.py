@@ -179,33 +179,43 @@ def test_friction_that_just_stops_a_node_has_the_derivative_of_sliding() -> None
     assert found[0].tolist() == [[[pytest.approx(1.0), pytest.approx(1.0)]]]
 
 
-def test_threads_and_batch_make_no_difference() -> None:
-    """Bit by bit, as forward; also in constants that particles or simulations share."""
-    given = state_leaves(2700, 3) | value_leaves(2700, 3)
-    wanted = ("x", "F", "actuation", "origin", *value_leaves(3, 1))
-    before = torch.get_num_threads()
+@pytest.mark.parametrize("batch", [1, 3])
+def test_threads_make_no_difference(batch: int) -> None:
+    """Bit by bit: sums are taken in one order, also over the particles or simulations that share a constant."""
+    given = state_leaves(2700, batch) | value_leaves(2700, batch)
+    leaves = {name: value.requires_grad_() for name, value in given.items()}
+    start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(2700, leaves), backend="native")
+    before, results = torch.get_num_threads(), []
     try:
-        results = []
         for threads in (1, 2, 2, 5):
             torch.set_num_threads(threads)
-            results.append(gradients(lambda leaves: varied(2700, leaves), given, wanted, 8, "native"))
+            final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
+            results.append((final.stack(), *torch.autograd.grad(loss(final), list(leaves.values()))))
     finally:
         torch.set_num_threads(before)
     for result in results[1:]:
-        assert all(torch.equal(result[name], results[0][name]) for name in wanted)
+        assert all(map(torch.equal, result, results[0]))
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To keep the tape within bounds; the gradients are the same."""
-    given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
-    whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
+    """With gradients to bound the tape, without them so that Ctrl-C is heard; neither changes anything."""
+    given, solver = state_leaves(60, 2), replace(solvers(60, 2)["three bodies"], backend="native")
     calls, forward = [], kernels.forward
     monkeypatch.setattr(kernels, "forward", lambda *arguments: calls.append(arguments[-1]) or forward(*arguments))
-    limit = solvers(60, 2)["three bodies"].kernels.tape_limit(torch.empty(13, 2, 60).double())
+
+    def results() -> tuple[Leaves, ParticleState]:
+        start = ParticleState(*(given[name] for name in STATE))
+        end = solver.step(start, given["actuation"], substeps=10, origin=given["origin"])
+        return gradients(lambda _: solver, given, ("x", "v", "actuation", "origin"), 10, "native"), end
+
+    slopes, end = results()
+    limit = solver.kernels.tape_limit(torch.empty(13, 2, 60).double())
     monkeypatch.setattr(kernels, "KEPT_BYTES", 4 * kernels.KEPT_BYTES // limit)
-    cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
-    assert calls == [4, 4, 2]
-    assert_gradients_close(cut, whole, 1e-14)
+    monkeypatch.setattr(kernels, "MIN_SUBSTEPS", 3)
+    slopes_in_pieces, end_in_pieces = results()
+    assert calls == [10, 10, *(3, 3, 3, 1), *(4, 4, 2)]
+    assert_identical(end_in_pieces, end)
+    assert_gradients_close(slopes_in_pieces, slopes, 1e-14)
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's own: it takes row by row
