@@ -25,16 +25,6 @@ def tolerance(kind_scale: float) -> float:
     return 5.0 * kind_scale / math.sqrt(COUNT)
 
 
-def test_sobol_numbers_fill_the_unit_square() -> None:
-    numbers = sampling.sobol(COUNT, 0)
-    assert numbers.shape == (COUNT, 2)
-    assert numbers.dtype == np.float64
-    assert 0 <= numbers.min() and numbers.max() < 1
-    np.testing.assert_allclose(numbers.mean(0), 0.5, atol=tolerance(12**-0.5))
-    np.testing.assert_allclose(numbers.var(0), 1 / 12, atol=tolerance(0.08))
-    assert len(np.unique(numbers, axis=0)) == COUNT
-
-
 def test_sobol_numbers_leave_no_holes() -> None:
     """1024 scrambled Sobol numbers: one in each of 32 x 32 boxes; random ones leave a third of them empty."""
 
