@@ -3,7 +3,6 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -57,12 +56,6 @@ def test_coulomb_friction(velocity: tuple[float, float], friction: float, expect
     assert after(VelocityRule("-y", friction=friction), *velocity) == expected
     turned = after(VelocityRule("+x", friction=friction), -velocity[1], velocity[0])
     assert turned == (expected[1], expected[0])
-
-
-def test_ranges_of_numpy_are_ranges() -> None:
-    low, high = np.int64(3), np.int32(5)
-    assert VelocityRule("-y", i=(low, high), j=(None, low)) == VelocityRule("-y", i=(3, 5), j=(None, 3))
-    assert type(VelocityRule("-y", i=(low, high)).i[0]) is int
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

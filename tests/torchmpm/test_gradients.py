@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("backend")
 
 B, N = 2, 40
 SUBSTEPS = 20
-NAMES = ("x", "v", "C", "F", "actuation", "mu", "lam", "yield_stress", "gravity", "mass", "volume")
+NAMES = ("x", "v", "C", "F", "actuation", "origin", "mu", "lam", "yield_stress", "gravity", "mass", "volume")
 SCENES = {
     "free": {"strain": 0.01, "rules": ()},
     "yielding": {"strain": 0.15, "rules": ()},
@@ -33,6 +33,7 @@ def inputs(strain: float) -> dict[str, Tensor]:
         "C": state.C,
         "F": state.F,
         "actuation": 40.0 * normal(B, 2, 16, 16, seed=1),
+        "origin": torch.tensor([[0.01, -0.02], [-0.07, 0.03]], dtype=torch.float64),
         "mu": 500.0 * scale,
         "lam": 50.0 * (1.0 + 0.1 * normal(B, N, seed=2).abs()),
         "yield_stress": torch.tensor(60.0, dtype=torch.float64),
@@ -48,7 +49,8 @@ def loss(given: dict[str, Tensor], rules: tuple[VelocityRule, ...], segment: int
     body = Body(N, material, given["mass"], given["volume"], muscle=True)
     solver = robot(N, bodies=(body,), gravity=given["gravity"], rules=rules, damping=0.999)
     start = ParticleState(given["x"], given["v"], given["C"], given["F"], given["x"].new_ones(B, N))
-    final = solver.step(start, given["actuation"], substeps=SUBSTEPS, segment=segment)
+    field, origin = given["actuation"], given["origin"]
+    final = solver.step(start, field, substeps=SUBSTEPS, segment=segment, origin=origin)
     return combination(final, 20, x=1.0, v=0.2, C=0.01, F=1.0)
 
 
@@ -76,7 +78,7 @@ def test_against_central_differences(scene: tuple[str, dict[str, Tensor]], name:
         return
     direction = normal(*given[name].shape, seed=30)
     # Where a step may cross a yield surface or a cell it is shorter; elsewhere rounding asks for a longer one.
-    step = (1e-6 if name in ("x", "F") else 1e-5) * given[name].abs().max().item()
+    step = (1e-6 if name in ("x", "F", "origin") else 1e-5) * given[name].abs().max().item()
     ahead, behind = (
         loss(given | {name: given[name] + side * step * direction}, options["rules"]).item() for side in (1, -1)
     )
