@@ -4,20 +4,18 @@ import ctypes
 import importlib.metadata
 import importlib.util
 import os
-import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from cuda_drivers import H100, RTX_4090, Recorded, Recorder, in_use
+from device_operators import DeviceOperators
 from native_scenes import RULES
 from scenes import lively, normal, robot, robot_and_ball
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchmpm import Grid, ParticleState, Solver, backends
 from torchmpm.native import kernels
@@ -26,9 +24,6 @@ from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
 from torchmpm.native.tables import BodyTable, RuleTable
 from torchmpm.solver import kernels_fail
-
-#: What a block has without asking.
-USUAL_SHARED_BYTES = 48 * 1024
 
 
 def window(count: int, **options: object) -> Solver:
@@ -46,44 +41,37 @@ def launches(
     return driver.launches
 
 
-def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
-    first, second = launches(window(2000), 64)
-    assert first.kernel.shared and not first.launch.cooperative
-    assert (first.launch.blocks, first.launch.threads) == (64, 512)
-    assert USUAL_SHARED_BYTES < first.launch.shared_bytes <= H100.shared_bytes
-    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1, 1)
-    assert first.kernel.threads * first.kernel.per_thread >= 2000
-    assert not second.kernel.shared and second.launch.cooperative
-    assert second.arguments.rows == second.arguments.columns == Grid(128).width
-    assert second.kernel.per_thread == 0 and second.arguments.team == 2
-    assert second.launch.blocks % second.arguments.team == 0 and second.launch.blocks <= 132
-    assert first.arguments.status == second.arguments.status != 0
-    assert first.arguments.result == second.arguments.result != 0
+#: Robots and their particles, a card, blocks that each of its multiprocessors can run; and what is launched: whether
+#: nodes are in shared memory, the blocks, those that share a robot, and the particles that a thread keeps.
+LAUNCHES = {
+    "small robots take a block each, others a team": (
+        64,
+        2000,
+        H100,
+        1,
+        [(True, 64, 1, 4), (False, 128, 2, 0)],
+    ),
+    "many robots take turns": (1024, 2000, H100, 1, [(True, 132, 1, 4), (False, 132, 2, 0)]),
+    "many robots take turns on twice the blocks": (1024, 2000, H100, 2, [(True, 264, 1, 4), (False, 264, 2, 0)]),
+    "a large robot takes all threads that it needs": (1, 22_000, H100, 1, [(False, 86, 86, 1)]),
+    "many large robots take a block each": (64, 22_000, H100, 1, [(True, 64, 1, 0), (False, 132, 22, 0)]),
+    "a robot with more particles than a card has threads": (1, 22_000, Card(16, 101_376), 1, [(False, 16, 16, 0)]),
+}
 
 
-def test_many_robots_take_turns_on_the_blocks_that_are_resident() -> None:
-    assert [one.launch.blocks for one in launches(window(2000), 1024)] == [132, 132]
-    assert launches(window(2000), 1024, blocks=2)[0].launch.blocks == 264
-
-
-def test_a_large_robot_takes_one_cooperative_launch() -> None:
-    """In which every thread has one particle, and all blocks are resident."""
-    (one,) = launches(window(22_000))
-    assert not one.kernel.shared and one.launch.cooperative and one.kernel.per_thread == 1
-    assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
-
-
-def test_many_large_robots_take_a_block_each() -> None:
-    """Whose threads keep no particles in registers; nodes are where a window holds most of them."""
-    first, second = launches(window(22_000), 64)
-    assert first.kernel.shared and first.kernel.per_thread == 0 and first.launch.blocks == 64
-    assert first.arguments.rows > plan.SMALLEST_WINDOW and second.launch.cooperative
-    assert second.kernel.per_thread == 0 and second.arguments.team == 22
-
-
-def test_a_robot_with_more_particles_than_the_card_has_threads() -> None:
-    (one,) = launches(window(22_000), card=Card(16, 101_376))
-    assert one.launch.blocks == one.arguments.team == 16 and one.kernel.per_thread == 0
+@pytest.mark.parametrize(("batch", "count", "card", "blocks", "expected"), LAUNCHES.values(), ids=LAUNCHES)
+def test_launches(batch: int, count: int, card: Card, blocks: int, expected: list[tuple[bool, int, int, int]]) -> None:
+    """Blocks that share a robot are launched together, and find those that were given up in the status."""
+    found = launches(window(count), batch, card=card, blocks=blocks)
+    for one, (shared, all_blocks, team, per_thread) in zip(found, expected, strict=True):
+        assert (one.kernel.shared, one.launch.cooperative) == (shared, not shared)
+        assert (one.launch.blocks, one.arguments.team, one.kernel.per_thread) == (all_blocks, team, per_thread)
+        rows, columns = one.arguments.rows, one.arguments.columns
+        assert one.launch.threads == one.kernel.threads == (512 if shared else 256)
+        assert one.launch.shared_bytes == one.kernel.shared_bytes(rows, columns, 1, 1) <= card.shared_bytes
+        assert rows == columns and (plan.SMALLEST_WINDOW < rows if shared else rows == Grid(128).width)
+    assert len({one.arguments.status for one in found}) == len({one.arguments.result for one in found}) == 1
+    assert (found[0].arguments.status is None) == (len(found) == 1)
 
 
 def test_two_bodies_in_one_block() -> None:
@@ -133,18 +121,6 @@ def test_kernels_are_those_of_the_scene() -> None:
     assert (driver.launches[0].kernel.real, driver.launches[0].kernel.muscles) == ("double", False)
 
 
-class Operators(TorchDispatchMode):
-    """Names of the operators that are called."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.names.append(str(function))
-        return function(*args, **(kwargs or {}))
-
-
 def test_arguments_are_those_of_the_call() -> None:
     """Sizes, constants, and the bytes of the tables on the device."""
     solver, kept = replace(window(50, rules=RULES), damping=0.999), []
@@ -178,9 +154,9 @@ def test_a_second_step_copies_nothing_to_the_device() -> None:
     state, solver = lively(50), window(50)
     with in_use(Recorder()), torch.no_grad():
         solver.step(state)
-        with Operators() as seen:
+        with DeviceOperators() as seen:
             solver.step(state)
-    assert not [name for name in seen.names if re.search("scalar|pin|lift", name)], seen.names
+    assert not seen.waits
 
 
 def test_too_little_memory_means_fewer_robots_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
