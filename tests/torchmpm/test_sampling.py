@@ -42,13 +42,6 @@ def test_a_seed_decides_and_nothing_global_is_touched() -> None:
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_box(numbers: np.ndarray) -> None:
-    points = sampling.box(numbers, (0.3, -0.2), (0.5, 0.1))
-    assert (points >= (0.3, -0.2)).all() and (points <= (0.8, -0.1)).all()
-    np.testing.assert_allclose(points.mean(0), (0.55, -0.15), atol=tolerance(0.15))
-    np.testing.assert_allclose(points.var(0), (0.25 / 12, 0.01 / 12), rtol=0.1)
-
-
 def test_disc_is_uniform(numbers: np.ndarray) -> None:
     """Uniform density: mean r^2 = R^2/2, and a disc of half the radius holds a quarter."""
     offset = sampling.disc(numbers, (0.4, 0.6), 0.2) - (0.4, 0.6)
