@@ -13,16 +13,14 @@ import pytest
 import torch
 from cuda_drivers import H100, RTX_4090, Recorded, Recorder, in_use
 from device_operators import DeviceOperators
-from native_scenes import RULES
-from scenes import lively, normal, robot, robot_and_ball
+from scenes import lively, robot
 from torch import Tensor
 
 from torchmpm import Grid, ParticleState, Solver, backends
 from torchmpm.native import kernels
 from torchmpm.native.cuda import compiler, launcher, plan
-from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
+from torchmpm.native.cuda.arguments import Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
-from torchmpm.native.tables import BodyTable, RuleTable
 from torchmpm.solver import kernels_fail
 
 
@@ -74,13 +72,6 @@ def test_launches(batch: int, count: int, card: Card, blocks: int, expected: lis
     assert (found[0].arguments.status is None) == (len(found) == 1)
 
 
-def test_two_bodies_in_one_block() -> None:
-    """If a window holds both; if not, the device notices and the next launch takes them."""
-    first, second = launches(replace(robot_and_ball(2000, 300), backend="native"))
-    assert first.kernel.shared and first.arguments.num_bodies == 2 and first.kernel.per_thread == 0
-    assert not second.kernel.shared and second.arguments.status == first.arguments.status
-
-
 @pytest.mark.parametrize("card", [H100, RTX_4090])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_windows_are_as_large_as_the_memory_of_a_block(card: Card, dtype: torch.dtype) -> None:
@@ -95,58 +86,12 @@ def test_a_card_that_cannot_run_a_block() -> None:
         launches(window(22_000), card=Card(1, 100))
 
 
-def test_gradients() -> None:
-    """Those that are wanted, on a tape for each resident block; the others have no memory to be written to."""
-    solver, field = window(2000), torch.zeros(200, 2, 128, 128, requires_grad=True)
-    with in_use(Recorder()) as driver:
-        end = solver.step(lively(2000, 200).to(torch.float32), field, substeps=100)
-        end.x.sum().backward()
-    forward, adjoint = driver.launches[:2], driver.launches[2:]
-    assert [one.kernel.adjoint for one in driver.launches] == [False, False, True, True]
-    for one in adjoint:
-        assert one.arguments.result_bar and one.arguments.components_bar and one.arguments.field_bar
-        assert one.arguments.values_bar is None and one.arguments.result is None
-        sizes = (one.arguments.rows, one.arguments.columns, 128, 2000, 100)
-        assert one.arguments.scratch_bytes == one.kernel.scratch_bytes(*sizes) > 100 * 13 * 2000 * 4
-    assert adjoint[0].launch.blocks == 132 and adjoint[0].arguments.team == 1
-    for one in forward:
-        assert one.arguments.result_bar is one.arguments.components_bar is one.arguments.field_bar is None
-
-
 def test_kernels_are_those_of_the_scene() -> None:
     first, _ = launches(window(2000))
     assert (first.kernel.real, first.kernel.kinds, first.kernel.muscles) == ("float", 2, True)
     with in_use(Recorder()) as driver, torch.no_grad():
         window(2000).step(lively(2000), substeps=1)
     assert (driver.launches[0].kernel.real, driver.launches[0].kernel.muscles) == ("double", False)
-
-
-def test_arguments_are_those_of_the_call() -> None:
-    """Sizes, constants, and the bytes of the tables on the device."""
-    solver, kept = replace(window(50, rules=RULES), damping=0.999), []
-    state, origin = lively(50, 3), normal(3, 2, seed=1)
-    field = normal(3, 2, 128, 128, seed=2)
-
-    class Reader(Recorder):
-        def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
-            super().launch(function, launch, arguments, device)
-            bodies = (BodyTable * arguments.num_bodies).from_address(arguments.bodies)
-            rules = (RuleTable * arguments.num_rules).from_address(arguments.rules)
-            counters = ctypes.c_int32 * (launch.cooperative * launch.blocks // arguments.team * COUNTERS)
-            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters or 1))))
-
-    with in_use(Reader()) as driver, torch.no_grad():
-        solver.step(state, field, substeps=7, origin=origin)
-    tables = solver.kernels.tables
-    for one, (bodies, rules, counters) in zip(driver.launches, kept, strict=True):
-        found = one.arguments
-        assert (found.batch, found.particles, found.substeps, found.resolution) == (3, 50, 7, 128)
-        assert (found.field, found.origin) == (field.data_ptr(), origin.data_ptr())
-        assert (found.h, found.dt, found.damping) == (1 / 128, solver.dt, 0.999)
-        assert (found.values_batch, found.value_columns) == (1, 1)
-        assert bodies == bytes(tables.bodies[0])
-        assert rules == b"".join(bytes(rule) for rule in tables.rules[: len(RULES)])
-        assert not any(counters)
 
 
 def test_a_second_step_copies_nothing_to_the_device() -> None:

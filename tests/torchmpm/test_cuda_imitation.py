@@ -15,7 +15,6 @@ from cuda_imitation import PLANS, Broken, Gpu, Imitation, Plan, Threads
 from native_scenes import NAMES, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
-    assert_broken_alone,
     assert_gradients_close,
     compare_gradients,
     gradients,
@@ -103,19 +102,6 @@ def test_a_window_follows_fast_robots(use: Callable[..., None]) -> None:
     compare_gradients(lambda _: solver, leaves, ("F", "actuation", "origin"), 25, 1e-9)
 
 
-def test_more_particles_than_registers(use: Callable[..., None]) -> None:
-    """Kept in memory they take the same steps, also where they leave the window or are outside of it."""
-    still = lively(COUNT, 2, corner=(0.75, 0.4))
-    state = replace(still, v=torch.tensor([5.0, 0.0]) + 0.0 * still.v, C=0.0 * still.C)
-    solver, field = robot(COUNT, rules=()), 40.0 * normal(2, 2, 16, 16, seed=1)
-    eager = step(solver, "eager", state, field, substeps=12)
-    moved = (eager.x - state.x).abs().amax(-1)
-    assert (moved == 0).any() and (moved.lt(0.005) & moved.gt(0)).any(), "some must be outside, some must leave"
-    for plan in (Plan(), Plan(sizes=(8, 0)), Plan(shared=False, team=2, teams=1)):
-        use(plan)
-        assert_close(step(solver, "native", state, field, substeps=12), eager, 1e-11)
-
-
 @pytest.mark.parametrize("corner", [(0.0, -0.1), (0.75, 0.8), (-0.2, 0.4)])
 def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None]) -> None:
     """Where weights are extrapolated, nodes do not exist, and particles are outside."""
@@ -123,16 +109,6 @@ def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None
     for plan in (Plan(), Plan(window=(12, 12)), Plan(shared=False, team=2)):
         use(plan)
         compare_gradients(lambda _: robot(COUNT, rules=()), given, tuple(given), 4, 1e-9)
-
-
-@pytest.mark.parametrize("name", ["x", "v", "F", "actuation"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_broken_robot_harms_no_other(name: str, value: float, dtype: torch.dtype, use: Callable[..., None]) -> None:
-    given = {key: t.to(dtype) for key, t in state_leaves(15, 3).items()}
-    given[name][1].view(-1)[::5] = value
-    use(Plan(team=2, teams=1))
-    assert_broken_alone(replace(solvers(15, 1)["three bodies"], backend="native"), given, 1e-5)
 
 
 def test_not_a_number_spreads_as_on_the_cpu(use: Callable[..., None]) -> None:
