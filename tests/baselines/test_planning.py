@@ -224,6 +224,15 @@ def test_samples_find_what_every_simulation_wants():
         CEMPlanner(small("run", substeps=1), by_samples(noise_grid=5))
 
 
+def test_distribution_moves_to_the_elites_that_are_finite():
+    planner = CEMPlanner(small("run", substeps=1), by_samples(momentum=0.25))
+    elites = torch.tensor([-0.2, 0.6, 0.9]).view(1, 1, 3, 1, 1, 1).expand(3, 1, 3, 2, 4, 4)
+    mean, std = torch.full((3, 1, 2, 4, 4), 0.4), torch.full((3, 1, 2, 4, 4), 0.8)
+    mean, std = planner._refit(mean, std, elites, torch.tensor([[True, True, False]]))
+    torch.testing.assert_close(mean, torch.full_like(mean, 0.25 * 0.4 + 0.75 * 0.2))
+    torch.testing.assert_close(std, torch.full_like(std, 0.25 * 0.8 + 0.75 * 0.4))
+
+
 @pytest.mark.parametrize("best", [0.25, 0.0])
 def test_what_is_kept_of_a_plan_and_rest_are_tried(best):
     config = by_samples(noise=0.3, initial_std=5.0, iterations=1)
