@@ -139,16 +139,6 @@ def test_in_one_thing_alone(wanted: str) -> None:
     compare_gradients(lambda leaves: varied(60, leaves), given, (wanted,), 5, 1e-10)
 
 
-@pytest.mark.parametrize("name", ["von Mises", "elastic"])
-def test_single_precision(name: str) -> None:
-    given = state_leaves(COUNT, 2)
-    wanted = ("x", "v", "C", "F", "actuation")
-    double = gradients(lambda _: solvers(COUNT, 2)[name], given, wanted, 20, "eager")
-    single = {key: value.float() for key, value in given.items()}
-    found = gradients(lambda _: solvers(COUNT, 2)[name], single, wanted, 20, "native")
-    assert_gradients_close({n: v.double() for n, v in found.items()}, double, 2e-3)
-
-
 def corner_leaves() -> Leaves:
     """At rest: F = I, F = 0, rotations, det F = 0, mirrored, and at the bounds of soil."""
     F = torch.eye(2, dtype=torch.float64).repeat(1, 12, 1, 1)
