@@ -192,19 +192,6 @@ def test_comparison_that_is_stopped_or_killed_goes_on(killed, number):
     assert not (folder / "error.txt").exists()
 
 
-@pytest.mark.slow
-def test_task_of_a_module_is_compared(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"])))
-    (tmp_path / "rolling.py").write_text(
-        "import dataclasses, dittogym\n"
-        "def roll(): return dataclasses.replace(dittogym.make_spec('run'), name='roll', horizon=12)\n"
-        "dittogym.register('roll', roll)"
-    )
-    assert compare(tmp_path / "out", "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0") == 0
-    assert (tmp_path / "out" / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
-
-
 # Processes: short programs stand for the real worker.
 
 PATIENT = "import os, sys; open('ready', 'w').close(); os.read(0, 1); open('ended', 'w').close(); sys.exit(143)"

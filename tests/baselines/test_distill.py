@@ -10,7 +10,7 @@ from watching import learn
 import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, Shac, train
-from baselines.distillation.learner import METRICS, Collector, Labels, drop_entries
+from baselines.distillation.learner import METRICS, Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project
 from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.segments import Nodes
@@ -175,6 +175,17 @@ def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
     collector = Collector(Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
     labels = collector.collect(6, share, lambda images: torch.zeros(2, 2, 8, 8), go_on)
     assert sorted((10 * labels.actions[:, 0, 0, 0]).round().int().tolist()) == expected
+
+
+def test_labels_of_all_rounds_are_drawn_with_their_images():
+    torch.manual_seed(0)
+    dataset = Dataset()
+    for numbers in (torch.arange(4), torch.arange(0), torch.arange(4, 8)):  # the second round has none
+        column = numbers[:, None, None, None]
+        dataset.add(Labels(column.expand(-1, 3, 64, 64).byte(), column.expand(-1, 2, 8, 8).float()))
+    images, actions = dataset.sample(200)
+    drawn = actions[:, 0, 0, 0]
+    assert len(dataset) == len(drawn.unique()) == 8 and torch.equal(images[:, 0, 0, 0].float(), drawn)
 
 
 def test_round_without_labels_has_no_fresh_loss():
