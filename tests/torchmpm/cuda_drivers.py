@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from cuda_imitation import Gpu, Plan
-from cuda_imitation import Imitation as PlannedLauncher
+from cuda_imitation import Gpu, Plan, PlannedLauncher
 
 from torchmpm.native import kernels
 from torchmpm.native.cuda import plan

@@ -185,7 +185,7 @@ PLANS = {
 }
 
 
-class Imitation(Launcher):
+class PlannedLauncher(Launcher):
     """The launcher with small blocks, on the CPU."""
 
     def __init__(self, gpu: Gpu, plan: Plan) -> None:

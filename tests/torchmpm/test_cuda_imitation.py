@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cuda_imitation import PLANS, Broken, Gpu, Imitation, Plan, Threads
+from cuda_imitation import PLANS, Broken, Gpu, Plan, PlannedLauncher, Threads
 from native_scenes import NAMES, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
@@ -38,7 +38,7 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Make the native backend run the CUDA kernels."""
 
     def patch(plan: Plan, gpu: Gpu | None = None) -> None:
-        launcher = Imitation(gpu or Gpu(), plan)
+        launcher = PlannedLauncher(gpu or Gpu(), plan)
         monkeypatch.setattr(kernels, "forward", launcher.forward)
         monkeypatch.setattr(kernels, "backward", launcher.backward)
 
