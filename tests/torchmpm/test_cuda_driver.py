@@ -126,7 +126,7 @@ def test_too_little_memory_means_fewer_robots_at_once(monkeypatch: pytest.Monkey
             torch.autograd.grad(end.x.sum(), field)
 
 
-needs_bindings = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-bindings")
+needs_bindings = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core and cuda-bindings")
 
 PROGRAM = """
 import contextlib, types
@@ -232,16 +232,13 @@ def test_a_damaged_kernel_is_compiled_again(compiled: list[tuple[str, str]], tmp
     assert [compiler.compile_kernel(KERNEL, "sm_90") for _ in range(2)] == [b"binary 2"] * 2
 
 
-needs_nvrtc = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
-
-
-@needs_nvrtc
+@needs_bindings
 def test_an_error_of_the_compiler_is_shown() -> None:
     with pytest.raises(ValueError, match=r"(?s)cannot be compiled for sm_90: .*broken"):
         compiler.compile_source("broken", "sm_90", {})
 
 
-@needs_nvrtc
+@needs_bindings
 @pytest.mark.slow
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("adjoint", [False, True])

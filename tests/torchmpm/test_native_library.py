@@ -73,29 +73,21 @@ def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.Monk
     assert list((tmp_path / "cache").rglob("*.so")) == []
 
 
-def no_interpreter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    script = tmp_path / "c++"
-    script.write_text("#!/no/such/interpreter\n")
-    script.chmod(0o755)
-    monkeypatch.setenv("CXX", str(script))
-
-
-def no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    no_interpreter(monkeypatch, tmp_path)
-    (tmp_path / "c++").write_bytes(b"\0 not a program")
-
-
-def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-
-
-@pytest.mark.parametrize("prevent", [no_interpreter, no_program, no_folder])
+@pytest.mark.parametrize(
+    "compiler",
+    ["#!/no/such/interpreter\n", "\0 not a program", None],
+    ids=["no interpreter", "no program", "no folder"],
+)
 def test_what_cannot_be_built_runs_eagerly(
-    prevent: Callable[..., None], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+    compiler: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     """And says why: a compiler that cannot be started, or file systems that cannot be written."""
-    prevent(monkeypatch, tmp_path)
+    if compiler is not None:
+        monkeypatch.setenv("CXX", script(tmp_path, ""))
+        (tmp_path / "c++").write_text(compiler)
+    else:
+        monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     warn_eager.cache_clear()
     monkeypatch.setattr(library, "family", lambda: None)
     assert_identical(*(robot(5, backend=name).step(lively(5)) for name in ("auto", "eager")))

@@ -1,4 +1,4 @@
-"""ParticleState: shapes, views on its planes, selection and branching."""
+"""ParticleState: shapes, selection, branching, files and processes."""
 
 import multiprocessing
 import pickle
@@ -36,19 +36,6 @@ def test_a_saved_state_is_loaded_without_running_code(tmp_path: Path) -> None:
     state = robot(7).step(lively(7), substeps=1)
     torch.save({"state": state}, tmp_path / "state.pt")
     assert_identical(torch.load(tmp_path / "state.pt", weights_only=True)["state"], state)
-
-
-def test_planes_are_the_components_and_invert() -> None:
-    state = lively(7, 2)
-    planes = state.components()
-    expected = [state.x[..., 0], state.x[..., 1], state.v[..., 0], state.v[..., 1]]
-    expected += [matrix[..., row, col] for matrix in (state.C, state.F) for row in (0, 1) for col in (0, 1)]
-    expected.append(state.Jp)
-    assert len(planes) == len(expected) == 13
-    assert all(torch.equal(plane, component) for plane, component in zip(planes, expected, strict=True))
-    again = ParticleState.from_stack(torch.stack(planes))
-    assert_identical(again, state)
-    assert all(plane.is_contiguous() for plane in again.components())
 
 
 @pytest.mark.parametrize(
