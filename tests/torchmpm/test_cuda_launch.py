@@ -13,10 +13,9 @@ import torch
 from cuda_drivers import Imitation, in_use
 from cuda_imitation import PLANS, Gpu
 from native_scenes import NAMES, RULES, assert_lost_alone, lost, moving, solvers
-from scenes import assert_close, assert_identical, lively, normal, robot
+from scenes import Leaves, assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
     STATE,
-    Leaves,
     assert_broken_alone,
     assert_gradients_close,
     compare_gradients,

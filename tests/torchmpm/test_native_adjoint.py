@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import assert_identical, combination, lively, normal, robot
+from scenes import Leaves, assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -17,7 +17,6 @@ pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 COUNT = 120
 STATE = ("x", "v", "C", "F", "Jp")
-Leaves = dict[str, Tensor]
 
 
 def state_leaves(count: int, batch: int) -> Leaves:
