@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from scenes import GRID, assert_close, assert_identical, generator, lively, normal, robot, robot_and_ball
+from scenes import GRID, assert_close, assert_identical, generator, lively, normal, positions, robot, robot_and_ball
 from test_material import return_by_svd
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed
 from torchmpm.materials.body import METHODS
+from torchmpm.substep import particles_to_grid
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -128,6 +129,20 @@ def test_against_a_loop_over_particles_and_nodes(strain: float, moved: float) ->
     assert torch.equal(found.Jp, state.Jp)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_positive_actuation_contracts(axis: int, sign: float) -> None:
+    """Along its own direction, a negative one extends; and never moves the centre of mass."""
+    state = ParticleState.at_rest(positions(300))
+    actuation = torch.zeros(1, 2, R, R, dtype=torch.float64)
+    actuation[:, axis] = sign * 40.0
+    result = robot(300, rules=(), gravity=(0.0, 0.0)).step(state, actuation, substeps=40)
+    growth = (result.x.std(1) / state.x.std(1) - 1.0)[0]
+    assert sign * growth[axis].item() < -1e-4
+    assert growth[axis].abs() > 3 * growth[1 - axis].abs()
+    torch.testing.assert_close(result.x.mean(1), state.x.mean(1), rtol=0, atol=1e-12)
+
+
 def test_steps_add_up() -> None:
     solver, state = robot(40), lively(40)
     assert_identical(solver.step(solver.step(state, substeps=4), substeps=3), solver.step(state, substeps=7))
@@ -137,6 +152,30 @@ def test_steps_add_up() -> None:
 # --- balances -------------------------------------------------------------------------------------------------------
 
 CONTACT = (VelocityRule("-y", j=(None, 7), friction=math.inf), VelocityRule("+x", i=(9, None), friction=0.4))
+
+
+@pytest.mark.parametrize("contact", [False, True], ids=["free", "contact"])
+def test_mass_and_momentum(contact: bool) -> None:
+    """Of two bodies with muscles, over 30 substeps: mass to 1e-12, also on the nodes, and the impulses to 1e-9."""
+    solver = robot_and_ball(300, 100, rules=CONTACT if contact else (), damping=0.999)
+    state, actuation, origin = lively(400), field(), torch.zeros(1, 2, dtype=torch.float64)
+    mass, before = diagnostics.mass(solver, state), diagnostics.momentum(solver, state)
+    impulses = {name: torch.zeros_like(before) for name in ("gravity", "damping", "boundary")}
+    for _ in range(30):
+        on_nodes = particles_to_grid(solver.scene(state, actuation, origin), state.components()).momentum[0].sum(-1)
+        torch.testing.assert_close(on_nodes, mass, rtol=1e-12, atol=0)
+        for name, impulse in diagnostics.impulses(solver, state, actuation).items():
+            impulses[name] += impulse
+        state = solver.step(state, actuation)
+    torch.testing.assert_close(diagnostics.mass(solver, state), mass, rtol=1e-12, atol=0)
+    change = diagnostics.momentum(solver, state) - before
+    error = (change - sum(impulses.values())).norm() / torch.maximum(before.norm(), change.norm())
+    assert error <= 1e-9, f"relative error {error:.1e}"
+    assert (impulses["boundary"].norm() > 0.1 * before.norm()) == contact, "the scene must do what its name says"
+    assert impulses["damping"].norm() > 1e-3 * before.norm()
+    if not contact:
+        weight = mass * torch.tensor([0.5, -9.8], dtype=torch.float64) * 0.003
+        torch.testing.assert_close(impulses["gravity"][0], weight, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("muscles", [False, True], ids=["passive", "muscles"])
