@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
 from filelock import FileLock
 
 from baselines.compare import paper, processes, worker
@@ -23,7 +22,6 @@ from baselines.compare.plan import Run, make_runs, read_plan, to_words
 from baselines.compare.processes import LocalExecutor, Resources, carry_out
 from baselines.compare.report import align, make_table, paired_differences, read_result, write_report
 from cfp.errors import ConfigError
-from cfp.evaluation.returns import t_interval
 from cfp.files import write_json, write_text
 from cfp.tables import read_table
 
@@ -194,19 +192,6 @@ def test_comparison_that_is_stopped_or_killed_goes_on(killed, number):
     assert not (folder / "error.txt").exists()
 
 
-@pytest.mark.slow
-def test_task_of_a_module_is_compared(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"])))
-    (tmp_path / "rolling.py").write_text(
-        "import dataclasses, dittogym\n"
-        "def roll(): return dataclasses.replace(dittogym.make_spec('run'), name='roll', horizon=12)\n"
-        "dittogym.register('roll', roll)"
-    )
-    assert compare(tmp_path / "out", "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0") == 0
-    assert (tmp_path / "out" / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
-
-
 # Processes: short programs stand for the real worker.
 
 PATIENT = "import os, sys; open('ready', 'w').close(); os.read(0, 1); open('ended', 'w').close(); sys.exit(143)"
@@ -324,23 +309,6 @@ def test_options_become_words():
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
-        ("--only 0 --report-only", "only cannot be combined with --report-only"),
-        ("--address head:6379", "address requires --executor ray, got head:6379"),
-        ("--executor ray --workers 2", "workers requires --executor local"),
-        ("--algos mpc other", "plan: algos.other must not hold target"),
-        ("--algos ../zero", "algos must be names without a path, got '../zero'"),
-    ],
-)
-def test_wrong_options_are_named(tmp_path, capsys, options, message):
-    plan = {"algos": {"other": {"algo": "mpc", "target": "M"}}} if "other" in options else PLAN
-    assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
 def test_tasks_of_one_name_in_two_modules_are_refused(monkeypatch):
     """They would have one folder, and the results of one of them would stand in the rows of both."""
     monkeypatch.setattr("baselines.compare.plan.reference_config", lambda options: None)
@@ -366,14 +334,6 @@ def test_a_folder_that_is_no_comparison_s_is_refused(tmp_path):
 
 
 # Statistics and the report.
-
-
-def test_t_interval_is_student_s():
-    values = [3.0, 5.0, 10.0, 2.0]
-    low, high = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    assert t_interval(values) == pytest.approx((high - low) / 2)
-    assert t_interval([0.0, 2.0]) == pytest.approx(12.7062, abs=1e-4)  # t(1) times sqrt(2) / sqrt(2)
-    assert t_interval([3.0]) is None
 
 
 def test_differences_are_paired_by_seed():

@@ -12,7 +12,6 @@ import cfp.train
 from baselines import Distill, OpenLoop, Shac, train
 from baselines.distillation.learner import METRICS, Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project
-from baselines.modular import segments as modular_segments
 from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.segments import Nodes
 from baselines.registry import configure
@@ -142,19 +141,17 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
             images = env.step(torch.as_tensor(action))[0]
 
 
-def test_resumed_with_a_teacher_that_remembers_it_is_the_same_to_the_last_bit(segments, monkeypatch):
-    """A policy of segments, which begins anew where an episode does; `test_programs` resumes with a planner."""
-    anew, fit = [], modular_segments.fit
-    monkeypatch.setattr(modular_segments, "fit", lambda x, count: anew.append(len(x)) or fit(x, count))
+def test_resumed_with_a_teacher_that_remembers_it_is_the_same_to_the_last_bit(segments):
+    """A policy of segments, and episodes that end; `test_programs` resumes with a planner."""
     whole, first, second = (make(teacher=str(segments), max_episode_steps=6) for _ in range(3))
     learn(whole, 32)
-    assert sum(anew) == 5, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
     learn(first, 16)
     second.load_state_dict(first.state_dict())
     second.num_timesteps = first.num_timesteps
     learn(second, 16)
     for name, value in whole.actor.state_dict().items():
         assert torch.equal(value, second.actor.state_dict()[name]), name
+    assert len(second.dataset) == len(whole.dataset) == 32
     for mine, theirs in zip(whole.dataset.rounds, second.dataset.rounds, strict=True):
         assert torch.equal(mine.observations, theirs.observations) and torch.equal(mine.actions, theirs.actions)
 
@@ -180,19 +177,15 @@ def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
     assert sorted((10 * labels.actions[:, 0, 0, 0]).round().int().tolist()) == expected
 
 
-def test_labels_survive_a_checkpoint():
-    dataset, copy = Dataset(), Dataset()
-    for index in (2, 3):
-        images = torch.full((4, 3, 64, 64), index, dtype=torch.uint8)
-        dataset.add(Labels(images, torch.full((4, 2, 8, 8), float(index))))
-        dataset.add(Labels(images[:0], torch.zeros(0, 2, 8, 8)))
-    assert len(dataset) == 8
-    copy.load_state_dict(dataset.state_dict())
-    for data in (dataset, copy):
-        torch.manual_seed(0)
-        images, actions = data.sample(200)
-        assert sorted(set(actions[:, 0, 0, 0].tolist())) == [2.0, 3.0]
-        assert torch.equal(images[:, 0, 0, 0].float(), actions[:, 0, 0, 0])
+def test_labels_of_all_rounds_are_drawn_with_their_images():
+    torch.manual_seed(0)
+    dataset = Dataset()
+    for numbers in (torch.arange(4), torch.arange(0), torch.arange(4, 8)):  # the second round has none
+        column = numbers[:, None, None, None]
+        dataset.add(Labels(column.expand(-1, 3, 64, 64).byte(), column.expand(-1, 2, 8, 8).float()))
+    images, actions = dataset.sample(200)
+    drawn = actions[:, 0, 0, 0]
+    assert len(dataset) == len(drawn.unique()) == 8 and torch.equal(images[:, 0, 0, 0].float(), drawn)
 
 
 def test_round_without_labels_has_no_fresh_loss():

@@ -65,18 +65,6 @@ def test_the_protocol_never_changes():
     assert SEEDS[0] > LARGEST_SEED + 3 * EVALUATION_SEED  # no run comes to its layouts
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_layouts_of_a_task_differ_unless_it_draws_no_positions(task):
-    states = []
-    for seed in SEEDS[:2]:
-        env = dittogym.TorchEnv(task, 1, particles="lite")
-        env.reset(seed=seed)
-        states.append(env.state.x)
-    assert torch.equal(*states) == (task in ("grow", "obstacle"))
-    draws = any(body.shape.draws for body in dittogym.make_spec(task).bodies)
-    assert draws == (task not in ("grow", "obstacle"))
-
-
 def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     config = replace(preset("shapematch", "quick"), **vars(tiny) | {"action_layout": "grid"})
     save_actor(tmp_path / "my policy.safetensors", build_actor(config.actor_spec(1)), config, 1, 1234)

@@ -23,7 +23,6 @@ from baselines.modular.segments import (
     pack,
     segment_means,
     squared_distances,
-    unpack,
     update,
     visible_positions,
 )
@@ -95,14 +94,6 @@ def test_neighbours_touch():
     centres = torch.tensor([[[0.05, 0.05], [0.15, 0.05], [0.65, 0.05]]])
     assert adjacency(x[:, :800], centres[:, :2])[0].tolist() == [[False, True], [True, False]]
     assert adjacency(x, centres)[0].int().tolist() == [[0, 1, 0], [1, 0, 1], [0, 1, 0]]
-
-
-@pytest.mark.parametrize("count", [16, 20, 64])
-def test_neighbours_survive_packing(count):
-    edges = torch.rand(2, count, count, generator=seeded()) < 0.4
-    packed = pack(edges)
-    assert packed.dtype == torch.float32 and packed.shape == (2, count, -(-count // 16))
-    assert torch.equal(unpack(packed, count), edges.float())
 
 
 def test_rows_say_what_the_segments_are():

@@ -80,9 +80,3 @@ def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
 def test_fine_from_scratch_has_the_size_of_the_papers(task, count):
     spec = find("fine").preset(task, "paper").actor_spec(1)
     assert sum(parameter.numel() for parameter in build_actor(spec).parameters()) == count
-
-
-def test_resolutions_can_be_studied():
-    config = configure({"algo": "fine", "task": "run", "resolutions": [4]})
-    config.check()
-    assert config.ends() == (config.steps,) and config.action_size(1) == 4

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from cuda_imitation import Gpu
+from cuda_imitation import Gpu, Plan, PlannedLauncher
 
 from torchmpm.native import kernels
 from torchmpm.native.cuda import plan
@@ -61,9 +61,9 @@ class Imitation(Gpu):
 
 
 @contextmanager
-def in_use(driver: Driver) -> Iterator[Any]:
-    """Meanwhile, the native backend runs kernels of this driver on tensors of the CPU."""
-    launcher = Launcher(driver)
+def in_use(driver: Driver, by_plan: Plan | None = None) -> Iterator[Any]:
+    """Meanwhile, the native backend runs kernels of this driver on tensors of the CPU, by a plan or by its own."""
+    launcher = Launcher(driver) if by_plan is None else PlannedLauncher(driver, by_plan)
     with pytest.MonkeyPatch.context() as patch:
         if isinstance(driver, Imitation):
             patch.setattr(plan, "SHARED_THREADS", 32)

@@ -174,7 +174,18 @@ class Plan:
     sizes: tuple[int, int] = (THREADS, PER_THREAD)
 
 
-class Imitation(Launcher):
+#: Nodes in shared memory, all of them or those in a window; in global memory with one block or two for each robot; and
+#: robots that do not fit the window, which are given up and taken by two blocks.
+PLANS = {
+    "shared": Plan(),
+    "window": Plan(window=(16, 14)),
+    "one block": Plan(shared=False, team=1),
+    "team": Plan(shared=False, team=2, teams=1),
+    "given up": Plan(window=(6, 6), team=2),
+}
+
+
+class PlannedLauncher(Launcher):
     """The launcher with small blocks, on the CPU."""
 
     def __init__(self, gpu: Gpu, plan: Plan) -> None:

@@ -1,10 +1,14 @@
 """Small scenes that several test files simulate."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises
 
+#: Tensors by name, in which a loss may be differentiated.
+Leaves = dict[str, Tensor]
 GRID = Grid(16)
 #: Of the solvers made here, unless a test says otherwise; some files run their tests once with each.
 BACKEND = "eager"
@@ -85,6 +89,16 @@ def combination(state: ParticleState, seed: int, **sizes: float) -> Tensor:
     """A random combination of fields, each times a factor that brings them to one size, so that none drowns others."""
     fields = enumerate((getattr(state, name), size) for name, size in sizes.items())
     return sum(size * (normal(*t.shape, seed=seed + k).to(t) * t).sum() for k, (t, size) in fields)
+
+
+def assert_slope(
+    loss: Callable[[Leaves], Tensor], given: Leaves, name: str, gradient: Tensor, step: float, rounding: float = 0.0
+) -> None:
+    """Compare a gradient with a central difference in a random direction, to 1e-5 and the rounding of the loss."""
+    direction = normal(*given[name].shape, seed=20)
+    ahead, behind = (loss(given | {name: given[name] + side * step * direction}).item() for side in (1, -1))
+    slope, difference = (gradient * direction).sum().item(), (ahead - behind) / (2 * step)
+    assert abs(slope - difference) <= 1e-5 * abs(difference) + rounding * max(abs(ahead), 1.0) / step, name
 
 
 def assert_close(first: ParticleState, second: ParticleState, tolerance: float) -> None:

@@ -228,3 +228,12 @@ def test_gravity_moves_a_particle_at_rest_by_less_than_a_cell(as_tensor: bool) -
         else:
             with pytest.raises(ValueError, match="gravity"):
                 robot(5, gravity=gravity)
+
+
+def test_small_integers_of_numpy_become_python_integers() -> None:
+    """Else sums and squares of them would overflow."""
+    assert Grid(np.uint8(128)).width ** 2 == 134**2
+    assert solver(grid=Grid(np.int16(200)), bodies=(body(count=np.int16(20000)),) * 2).num_particles == 40000
+    low, high = np.int64(3), np.int32(5)
+    assert type(VelocityRule("-y", i=(low, high)).i[0]) is int
+    assert VelocityRule("-y", i=(low, high), j=(None, low)) == VelocityRule("-y", i=(3, 5), j=(None, 3))

@@ -4,31 +4,24 @@ import ctypes
 import importlib.metadata
 import importlib.util
 import os
-import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from cuda_drivers import H100, RTX_4090, Recorded, Recorder, in_use
-from native_scenes import RULES
-from scenes import lively, normal, robot, robot_and_ball
+from device_operators import DeviceOperators
+from scenes import lively, robot
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchmpm import Grid, ParticleState, Solver, backends
 from torchmpm.native import kernels
 from torchmpm.native.cuda import compiler, launcher, plan
-from torchmpm.native.cuda.arguments import COUNTERS, Arguments, Kernel
+from torchmpm.native.cuda.arguments import Arguments, Kernel
 from torchmpm.native.cuda.driver import Card, Launch
-from torchmpm.native.tables import BodyTable, RuleTable
 from torchmpm.solver import kernels_fail
-
-#: What a block has without asking.
-USUAL_SHARED_BYTES = 48 * 1024
 
 
 def window(count: int, **options: object) -> Solver:
@@ -46,51 +39,37 @@ def launches(
     return driver.launches
 
 
-def test_small_robots_take_a_block_each_and_those_given_up_a_team() -> None:
-    first, second = launches(window(2000), 64)
-    assert first.kernel.shared and not first.launch.cooperative
-    assert (first.launch.blocks, first.launch.threads) == (64, 512)
-    assert USUAL_SHARED_BYTES < first.launch.shared_bytes <= H100.shared_bytes
-    assert first.launch.shared_bytes == first.kernel.shared_bytes(first.arguments.rows, first.arguments.columns, 1, 1)
-    assert first.kernel.threads * first.kernel.per_thread >= 2000
-    assert not second.kernel.shared and second.launch.cooperative
-    assert second.arguments.rows == second.arguments.columns == Grid(128).width
-    assert second.kernel.per_thread == 0 and second.arguments.team == 2
-    assert second.launch.blocks % second.arguments.team == 0 and second.launch.blocks <= 132
-    assert first.arguments.status == second.arguments.status != 0
-    assert first.arguments.result == second.arguments.result != 0
+#: Robots and their particles, a card, blocks that each of its multiprocessors can run; and what is launched: whether
+#: nodes are in shared memory, the blocks, those that share a robot, and the particles that a thread keeps.
+LAUNCHES = {
+    "small robots take a block each, others a team": (
+        64,
+        2000,
+        H100,
+        1,
+        [(True, 64, 1, 4), (False, 128, 2, 0)],
+    ),
+    "many robots take turns": (1024, 2000, H100, 1, [(True, 132, 1, 4), (False, 132, 2, 0)]),
+    "many robots take turns on twice the blocks": (1024, 2000, H100, 2, [(True, 264, 1, 4), (False, 264, 2, 0)]),
+    "a large robot takes all threads that it needs": (1, 22_000, H100, 1, [(False, 86, 86, 1)]),
+    "many large robots take a block each": (64, 22_000, H100, 1, [(True, 64, 1, 0), (False, 132, 22, 0)]),
+    "a robot with more particles than a card has threads": (1, 22_000, Card(16, 101_376), 1, [(False, 16, 16, 0)]),
+}
 
 
-def test_many_robots_take_turns_on_the_blocks_that_are_resident() -> None:
-    assert [one.launch.blocks for one in launches(window(2000), 1024)] == [132, 132]
-    assert launches(window(2000), 1024, blocks=2)[0].launch.blocks == 264
-
-
-def test_a_large_robot_takes_one_cooperative_launch() -> None:
-    """In which every thread has one particle, and all blocks are resident."""
-    (one,) = launches(window(22_000))
-    assert not one.kernel.shared and one.launch.cooperative and one.kernel.per_thread == 1
-    assert one.launch.blocks == one.arguments.team == 86 and one.arguments.status is None
-
-
-def test_many_large_robots_take_a_block_each() -> None:
-    """Whose threads keep no particles in registers; nodes are where a window holds most of them."""
-    first, second = launches(window(22_000), 64)
-    assert first.kernel.shared and first.kernel.per_thread == 0 and first.launch.blocks == 64
-    assert first.arguments.rows > plan.SMALLEST_WINDOW and second.launch.cooperative
-    assert second.kernel.per_thread == 0 and second.arguments.team == 22
-
-
-def test_a_robot_with_more_particles_than_the_card_has_threads() -> None:
-    (one,) = launches(window(22_000), card=Card(16, 101_376))
-    assert one.launch.blocks == one.arguments.team == 16 and one.kernel.per_thread == 0
-
-
-def test_two_bodies_in_one_block() -> None:
-    """If a window holds both; if not, the device notices and the next launch takes them."""
-    first, second = launches(replace(robot_and_ball(2000, 300), backend="native"))
-    assert first.kernel.shared and first.arguments.num_bodies == 2 and first.kernel.per_thread == 0
-    assert not second.kernel.shared and second.arguments.status == first.arguments.status
+@pytest.mark.parametrize(("batch", "count", "card", "blocks", "expected"), LAUNCHES.values(), ids=LAUNCHES)
+def test_launches(batch: int, count: int, card: Card, blocks: int, expected: list[tuple[bool, int, int, int]]) -> None:
+    """Blocks that share a robot are launched together, and find those that were given up in the status."""
+    found = launches(window(count), batch, card=card, blocks=blocks)
+    for one, (shared, all_blocks, team, per_thread) in zip(found, expected, strict=True):
+        assert (one.kernel.shared, one.launch.cooperative) == (shared, not shared)
+        assert (one.launch.blocks, one.arguments.team, one.kernel.per_thread) == (all_blocks, team, per_thread)
+        rows, columns = one.arguments.rows, one.arguments.columns
+        assert one.launch.threads == one.kernel.threads == (512 if shared else 256)
+        assert one.launch.shared_bytes == one.kernel.shared_bytes(rows, columns, 1, 1) <= card.shared_bytes
+        assert rows == columns and (plan.SMALLEST_WINDOW < rows if shared else rows == Grid(128).width)
+    assert len({one.arguments.status for one in found}) == len({one.arguments.result for one in found}) == 1
+    assert (found[0].arguments.status is None) == (len(found) == 1)
 
 
 @pytest.mark.parametrize("card", [H100, RTX_4090])
@@ -107,24 +86,6 @@ def test_a_card_that_cannot_run_a_block() -> None:
         launches(window(22_000), card=Card(1, 100))
 
 
-def test_gradients() -> None:
-    """Those that are wanted, on a tape for each resident block; the others have no memory to be written to."""
-    solver, field = window(2000), torch.zeros(200, 2, 128, 128, requires_grad=True)
-    with in_use(Recorder()) as driver:
-        end = solver.step(lively(2000, 200).to(torch.float32), field, substeps=100)
-        end.x.sum().backward()
-    forward, adjoint = driver.launches[:2], driver.launches[2:]
-    assert [one.kernel.adjoint for one in driver.launches] == [False, False, True, True]
-    for one in adjoint:
-        assert one.arguments.result_bar and one.arguments.components_bar and one.arguments.field_bar
-        assert one.arguments.values_bar is None and one.arguments.result is None
-        sizes = (one.arguments.rows, one.arguments.columns, 128, 2000, 100)
-        assert one.arguments.scratch_bytes == one.kernel.scratch_bytes(*sizes) > 100 * 13 * 2000 * 4
-    assert adjoint[0].launch.blocks == 132 and adjoint[0].arguments.team == 1
-    for one in forward:
-        assert one.arguments.result_bar is one.arguments.components_bar is one.arguments.field_bar is None
-
-
 def test_kernels_are_those_of_the_scene() -> None:
     first, _ = launches(window(2000))
     assert (first.kernel.real, first.kernel.kinds, first.kernel.muscles) == ("float", 2, True)
@@ -133,54 +94,14 @@ def test_kernels_are_those_of_the_scene() -> None:
     assert (driver.launches[0].kernel.real, driver.launches[0].kernel.muscles) == ("double", False)
 
 
-class Operators(TorchDispatchMode):
-    """Names of the operators that are called."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.names.append(str(function))
-        return function(*args, **(kwargs or {}))
-
-
-def test_arguments_are_those_of_the_call() -> None:
-    """Sizes, constants, and the bytes of the tables on the device."""
-    solver, kept = replace(window(50, rules=RULES), damping=0.999), []
-    state, origin = lively(50, 3), normal(3, 2, seed=1)
-    field = normal(3, 2, 128, 128, seed=2)
-
-    class Reader(Recorder):
-        def launch(self, function: Kernel, launch: Launch, arguments: Arguments, device: torch.device) -> None:
-            super().launch(function, launch, arguments, device)
-            bodies = (BodyTable * arguments.num_bodies).from_address(arguments.bodies)
-            rules = (RuleTable * arguments.num_rules).from_address(arguments.rules)
-            counters = ctypes.c_int32 * (launch.cooperative * launch.blocks // arguments.team * COUNTERS)
-            kept.append((bytes(bodies), bytes(rules), bytes(counters.from_address(arguments.counters or 1))))
-
-    with in_use(Reader()) as driver, torch.no_grad():
-        solver.step(state, field, substeps=7, origin=origin)
-    tables = solver.kernels.tables
-    for one, (bodies, rules, counters) in zip(driver.launches, kept, strict=True):
-        found = one.arguments
-        assert (found.batch, found.particles, found.substeps, found.resolution) == (3, 50, 7, 128)
-        assert (found.field, found.origin) == (field.data_ptr(), origin.data_ptr())
-        assert (found.h, found.dt, found.damping) == (1 / 128, solver.dt, 0.999)
-        assert (found.values_batch, found.value_columns) == (1, 1)
-        assert bodies == bytes(tables.bodies[0])
-        assert rules == b"".join(bytes(rule) for rule in tables.rules[: len(RULES)])
-        assert not any(counters)
-
-
 def test_a_second_step_copies_nothing_to_the_device() -> None:
     """It only makes room for results and scratch memory, and sets counters to zero."""
     state, solver = lively(50), window(50)
     with in_use(Recorder()), torch.no_grad():
         solver.step(state)
-        with Operators() as seen:
+        with DeviceOperators() as seen:
             solver.step(state)
-    assert not [name for name in seen.names if re.search("scalar|pin|lift", name)], seen.names
+    assert not seen.waits
 
 
 def test_too_little_memory_means_fewer_robots_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,7 +126,7 @@ def test_too_little_memory_means_fewer_robots_at_once(monkeypatch: pytest.Monkey
             torch.autograd.grad(end.x.sum(), field)
 
 
-needs_bindings = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-bindings")
+needs_bindings = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core and cuda-bindings")
 
 PROGRAM = """
 import contextlib, types
@@ -311,21 +232,13 @@ def test_a_damaged_kernel_is_compiled_again(compiled: list[tuple[str, str]], tmp
     assert [compiler.compile_kernel(KERNEL, "sm_90") for _ in range(2)] == [b"binary 2"] * 2
 
 
-def test_a_folder_that_cannot_be_written(compiled: list[tuple[str, str]], tmp_path: Path) -> None:
-    (tmp_path / "torchmpm").write_text("a file where the folder should be")
-    assert [compiler.compile_kernel(KERNEL, "sm_90") for _ in range(2)] == [b"binary 1", b"binary 2"]
-
-
-needs_nvrtc = pytest.mark.skipif(importlib.util.find_spec("cuda") is None, reason="no cuda-core")
-
-
-@needs_nvrtc
+@needs_bindings
 def test_an_error_of_the_compiler_is_shown() -> None:
     with pytest.raises(ValueError, match=r"(?s)cannot be compiled for sm_90: .*broken"):
         compiler.compile_source("broken", "sm_90", {})
 
 
-@needs_nvrtc
+@needs_bindings
 @pytest.mark.slow
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("adjoint", [False, True])

@@ -11,17 +11,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cuda_imitation import Broken, Gpu, Imitation, Plan, Threads
-from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
+from cuda_imitation import PLANS, Broken, Gpu, Plan, PlannedLauncher, Threads
+from native_scenes import NAMES, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 from test_native_adjoint import (
-    assert_broken_alone,
     assert_gradients_close,
     compare_gradients,
     gradients,
     state_leaves,
-    value_leaves,
-    varied,
 )
 from torch import Tensor
 
@@ -33,15 +30,6 @@ from torchmpm.native.cuda.compiler import FOLDERS
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 COUNT = 60
-#: Nodes in shared memory, all of them or those in a window; in global memory with one block or two for each robot; and
-#: robots that do not fit the window, which are given up and taken by two blocks.
-PLANS = {
-    "shared": Plan(),
-    "window": Plan(window=(16, 14)),
-    "one block": Plan(shared=False, team=1),
-    "team": Plan(shared=False, team=2, teams=1),
-    "given up": Plan(window=(6, 6), team=2),
-}
 every_plan = pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
 
 
@@ -50,7 +38,7 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Make the native backend run the CUDA kernels."""
 
     def patch(plan: Plan, gpu: Gpu | None = None) -> None:
-        launcher = Imitation(gpu or Gpu(), plan)
+        launcher = PlannedLauncher(gpu or Gpu(), plan)
         monkeypatch.setattr(kernels, "forward", launcher.forward)
         monkeypatch.setattr(kernels, "backward", launcher.backward)
 
@@ -59,15 +47,6 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def step(solver: Solver, backend: str, *arguments: object, **options: object) -> ParticleState:
     return replace(solver, backend=backend).step(*arguments, **options)
-
-
-@every_plan
-@pytest.mark.parametrize("name", NAMES)
-def test_equals_eager(name: str, plan: Plan, use: Callable[..., None]) -> None:
-    state, field, origin = moving(COUNT, 3)
-    solver = solvers(COUNT, 3)[name]
-    use(plan)
-    assert_close(*(step(solver, b, state, field, substeps=8, origin=origin) for b in ("native", "eager")), 1e-12)
 
 
 @every_plan
@@ -98,22 +77,6 @@ def test_order_of_threads_makes_no_difference(plan: Plan, dtype: torch.dtype, us
 
 @every_plan
 @pytest.mark.parametrize("name", NAMES)
-def test_gradients_in_state_actuation_and_origin(name: str, plan: Plan, use: Callable[..., None]) -> None:
-    given = state_leaves(COUNT, 3)
-    use(plan)
-    compare_gradients(lambda _: solvers(COUNT, 3)[name], given, tuple(given), 6, 1e-10)
-
-
-@every_plan
-def test_gradients_in_values(plan: Plan, use: Callable[..., None]) -> None:
-    """Of every material, in every shape; masses, volumes and gravity too."""
-    given, wanted = state_leaves(COUNT, 2) | value_leaves(COUNT, 2), tuple(value_leaves(3, 1))
-    use(plan)
-    compare_gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 5, 1e-9)
-
-
-@every_plan
-@pytest.mark.parametrize("name", NAMES)
 def test_gradients_in_single_precision(name: str, plan: Plan, use: Callable[..., None]) -> None:
     given = state_leaves(COUNT, 2)
     double = gradients(lambda _: solvers(COUNT, 2)[name], given, tuple(given), 8, "eager")
@@ -139,46 +102,6 @@ def test_a_window_follows_fast_robots(use: Callable[..., None]) -> None:
     compare_gradients(lambda _: solver, leaves, ("F", "actuation", "origin"), 25, 1e-9)
 
 
-@pytest.mark.parametrize("count", [1, 31, 32, 33, 64])
-def test_sizes(count: int, use: Callable[..., None]) -> None:
-    """Around the sizes of blocks."""
-    for plan in (Plan(), Plan(shared=False, team=2)):
-        use(plan)
-        field = 40.0 * normal(2, 2, 16, 16, seed=1)
-        assert_close(*(step(robot(count), b, lively(count, 2), field, substeps=2) for b in ("native", "eager")), 1e-12)
-
-
-def test_more_particles_than_registers(use: Callable[..., None]) -> None:
-    """Kept in memory they take the same steps, also where they leave the window or are outside of it."""
-    still = lively(COUNT, 2, corner=(0.75, 0.4))
-    state = replace(still, v=torch.tensor([5.0, 0.0]) + 0.0 * still.v, C=0.0 * still.C)
-    solver, field = robot(COUNT, rules=()), 40.0 * normal(2, 2, 16, 16, seed=1)
-    eager = step(solver, "eager", state, field, substeps=12)
-    moved = (eager.x - state.x).abs().amax(-1)
-    assert (moved == 0).any() and (moved.lt(0.005) & moved.gt(0)).any(), "some must be outside, some must leave"
-    for plan in (Plan(), Plan(sizes=(8, 0)), Plan(shared=False, team=2, teams=1)):
-        use(plan)
-        assert_close(step(solver, "native", state, field, substeps=12), eager, 1e-11)
-
-
-def test_without_muscles(use: Callable[..., None]) -> None:
-    """Kernels that have none."""
-    solver, given = robot(COUNT), state_leaves(COUNT, 2)
-    use(Plan(muscles=False))
-    native, eager = (step(solver, b, lively(COUNT, 2), substeps=4) for b in ("native", "eager"))
-    assert_close(native, eager, 1e-12)
-    passive = replace(solver, bodies=(replace(solver.bodies[0], muscle=False),))
-    compare_gradients(lambda _: passive, given, ("x",), 3, 1e-10)
-
-
-@pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
-def test_positions_no_address_exists_for(y: float, use: Callable[..., None]) -> None:
-    for plan in (Plan(window=(16, 14), muscles=False), Plan(shared=False, team=2, muscles=False)):
-        use(plan)
-        native, eager = (step(robot(10, rules=()), b, lost(10, y), substeps=2) for b in ("native", "eager"))
-        assert_lost_alone(native, eager, lost(10, y), 1e-13)
-
-
 @pytest.mark.parametrize("corner", [(0.0, -0.1), (0.75, 0.8), (-0.2, 0.4)])
 def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None]) -> None:
     """Where weights are extrapolated, nodes do not exist, and particles are outside."""
@@ -186,16 +109,6 @@ def test_ends_of_the_window(corner: tuple[float, float], use: Callable[..., None
     for plan in (Plan(), Plan(window=(12, 12)), Plan(shared=False, team=2)):
         use(plan)
         compare_gradients(lambda _: robot(COUNT, rules=()), given, tuple(given), 4, 1e-9)
-
-
-@pytest.mark.parametrize("name", ["x", "v", "F", "actuation"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_broken_robot_harms_no_other(name: str, value: float, dtype: torch.dtype, use: Callable[..., None]) -> None:
-    given = {key: t.to(dtype) for key, t in state_leaves(15, 3).items()}
-    given[name][1].view(-1)[::5] = value
-    use(Plan(team=2, teams=1))
-    assert_broken_alone(replace(solvers(15, 1)["three bodies"], backend="native"), given, 1e-5)
 
 
 def test_not_a_number_spreads_as_on_the_cpu(use: Callable[..., None]) -> None:

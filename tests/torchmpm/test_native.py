@@ -15,7 +15,6 @@ from scenes import assert_as_precise, assert_close, assert_identical, lively, no
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.grid import PAD
-from torchmpm.native import kernels
 from torchmpm.native.kernels import MAX_PARTICLES, MAX_RESOLUTION
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
@@ -67,23 +66,6 @@ def test_state_in_other_strides() -> None:
     assert_close(*both(robot(60), state, transposed, substeps=5, origin=origin.T.contiguous().T), 1e-12)
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_threads_make_no_difference(batch: int) -> None:
-    """Bit by bit: sums are taken in one order, however many threads share them."""
-    state, field, origin = moving(2700, batch)
-    solver = replace(solvers(2700, batch)["three bodies"], backend="native")
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 2, 5):
-            torch.set_num_threads(threads)
-            results.append(solver.step(state, field, substeps=20, origin=origin))
-    finally:
-        torch.set_num_threads(before)
-    for result in results[1:]:
-        assert_identical(result, results[0])
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_constant_is_the_same_in_every_form(dtype: torch.dtype) -> None:
     """Bit by bit: as a number, and beside the constants of others as one for each simulation or particle."""
@@ -111,21 +93,14 @@ def test_positions_no_address_exists_for(y: float) -> None:
 
 def test_what_the_kernels_do_not_support_is_named() -> None:
     """Eight numbers of each node of a simulation, and its particles, must have places below 2^31."""
-
-    class Own(VonMises):
-        """Somebody's material."""
-
     assert 8 * (MAX_RESOLUTION + 2 * PAD) ** 2 < 2**31
     cases = {
-        "Own": robot(10, bodies=(Body(10, Own(500.0, 50.0, 60.0)),)),
         "300": robot(10, rules=(VelocityRule("-y"),) * 300),
         "16,001": robot(10, grid=Grid(MAX_RESOLUTION + 1), dt=1e-9),
         "1,073,741,825": robot(MAX_PARTICLES + 1),
     }
     for named, solver in cases.items():
         assert named in str(solver.kernels.unsupported(torch.device("cpu")))
-    with pytest.raises(ValueError, match="Own"):
-        replace(cases["Own"], backend="native").step(lively(10))
     largest = robot(MAX_PARTICLES, grid=Grid(MAX_RESOLUTION), dt=1e-9)
     assert largest.kernels.unsupported(torch.device("cpu")) is None
 
@@ -176,25 +151,6 @@ def test_soil_without_hardening_has_no_derivative_in_jp(backend: str) -> None:
     Jp = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
     later = solver.step(replace(rest, F=0.99 * rest.F, Jp=Jp), substeps=2)
     assert later.C.abs().max() > 0 and torch.autograd.grad(later.C.sum(), Jp)[0].item() == 0
-
-
-def test_a_particle_at_the_right_end_of_the_window_is_where_the_grid_says() -> None:
-    solver = Solver(Grid(5, 0.1), (Body(1, VonMises(500.0, 50.0, 62.0), mass=2.0),), gravity=(0.0, -9.0))
-    for x in (solver.grid.extent, math.nextafter(solver.grid.extent, 0.0)):
-        state = ParticleState.at_rest(torch.tensor([[[x, 0.25]]], dtype=torch.float64))
-        native, eager = both(solver, state, substeps=2)
-        assert bool(native.v.any()) == bool(eager.v.any()) == (x < solver.grid.extent)
-
-
-def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without gradients that changes nothing either."""
-    state, field, origin = moving(COUNT, 3)
-    solver = replace(solvers(COUNT, 3)["three bodies"], backend="native")
-    whole = solver.step(state, field, substeps=250, origin=origin)
-    monkeypatch.setattr(kernels, "KEPT_BYTES", 0)
-    assert_identical(solver.step(state, field, substeps=250, origin=origin), whole)
-    monkeypatch.setattr(kernels, "MIN_SUBSTEPS", 7)
-    assert_identical(solver.step(state, field, substeps=250, origin=origin), whole)
 
 
 ENDLESS = """

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from native_scenes import NAMES, RULES, moving, solvers, values
-from scenes import assert_identical, combination, lively, normal, robot
+from scenes import Leaves, assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -17,7 +17,6 @@ pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 COUNT = 120
 STATE = ("x", "v", "C", "F", "Jp")
-Leaves = dict[str, Tensor]
 
 
 def state_leaves(count: int, batch: int) -> Leaves:
@@ -139,16 +138,6 @@ def test_in_one_thing_alone(wanted: str) -> None:
     compare_gradients(lambda leaves: varied(60, leaves), given, (wanted,), 5, 1e-10)
 
 
-@pytest.mark.parametrize("name", ["von Mises", "elastic"])
-def test_single_precision(name: str) -> None:
-    given = state_leaves(COUNT, 2)
-    wanted = ("x", "v", "C", "F", "actuation")
-    double = gradients(lambda _: solvers(COUNT, 2)[name], given, wanted, 20, "eager")
-    single = {key: value.float() for key, value in given.items()}
-    found = gradients(lambda _: solvers(COUNT, 2)[name], single, wanted, 20, "native")
-    assert_gradients_close({n: v.double() for n, v in found.items()}, double, 2e-3)
-
-
 def corner_leaves() -> Leaves:
     """At rest: F = I, F = 0, rotations, det F = 0, mirrored, and at the bounds of soil."""
     F = torch.eye(2, dtype=torch.float64).repeat(1, 12, 1, 1)
@@ -179,33 +168,43 @@ def test_friction_that_just_stops_a_node_has_the_derivative_of_sliding() -> None
     assert found[0].tolist() == [[[pytest.approx(1.0), pytest.approx(1.0)]]]
 
 
-def test_threads_and_batch_make_no_difference() -> None:
-    """Bit by bit, as forward; also in constants that particles or simulations share."""
-    given = state_leaves(2700, 3) | value_leaves(2700, 3)
-    wanted = ("x", "F", "actuation", "origin", *value_leaves(3, 1))
-    before = torch.get_num_threads()
+@pytest.mark.parametrize("batch", [1, 3])
+def test_threads_make_no_difference(batch: int) -> None:
+    """Bit by bit: sums are taken in one order, also over the particles or simulations that share a constant."""
+    given = state_leaves(2700, batch) | value_leaves(2700, batch)
+    leaves = {name: value.requires_grad_() for name, value in given.items()}
+    start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(2700, leaves), backend="native")
+    before, results = torch.get_num_threads(), []
     try:
-        results = []
         for threads in (1, 2, 2, 5):
             torch.set_num_threads(threads)
-            results.append(gradients(lambda leaves: varied(2700, leaves), given, wanted, 8, "native"))
+            final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
+            results.append((final.stack(), *torch.autograd.grad(loss(final), list(leaves.values()))))
     finally:
         torch.set_num_threads(before)
     for result in results[1:]:
-        assert all(torch.equal(result[name], results[0][name]) for name in wanted)
+        assert all(map(torch.equal, result, results[0]))
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To keep the tape within bounds; the gradients are the same."""
-    given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
-    whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
+    """With gradients to bound the tape, without them so that Ctrl-C is heard; neither changes anything."""
+    given, solver = state_leaves(60, 2), replace(solvers(60, 2)["three bodies"], backend="native")
     calls, forward = [], kernels.forward
     monkeypatch.setattr(kernels, "forward", lambda *arguments: calls.append(arguments[-1]) or forward(*arguments))
-    limit = solvers(60, 2)["three bodies"].kernels.tape_limit(torch.empty(13, 2, 60).double())
+
+    def results() -> tuple[Leaves, ParticleState]:
+        start = ParticleState(*(given[name] for name in STATE))
+        end = solver.step(start, given["actuation"], substeps=10, origin=given["origin"])
+        return gradients(lambda _: solver, given, ("x", "v", "actuation", "origin"), 10, "native"), end
+
+    slopes, end = results()
+    limit = solver.kernels.tape_limit(torch.empty(13, 2, 60).double())
     monkeypatch.setattr(kernels, "KEPT_BYTES", 4 * kernels.KEPT_BYTES // limit)
-    cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
-    assert calls == [4, 4, 2]
-    assert_gradients_close(cut, whole, 1e-14)
+    monkeypatch.setattr(kernels, "MIN_SUBSTEPS", 3)
+    slopes_in_pieces, end_in_pieces = results()
+    assert calls == [10, 10, *(3, 3, 3, 1), *(4, 4, 2)]
+    assert_identical(end_in_pieces, end)
+    assert_gradients_close(slopes_in_pieces, slopes, 1e-14)
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's own: it takes row by row

@@ -64,7 +64,8 @@ def test_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("CXX", script(tmp_path, "echo 'no room on device' >&2; exit 3"))
+    """It may write any bytes, as in a language whose letters are not in UTF-8."""
+    monkeypatch.setenv("CXX", script(tmp_path, r"printf 'no room on device \374\n' >&2; exit 3"))
     for _ in range(2):
         with pytest.raises(ValueError, match="no room on device"):
             robot(5, backend="native").step(lively(5))
@@ -72,43 +73,21 @@ def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.Monk
     assert list((tmp_path / "cache").rglob("*.so")) == []
 
 
-def test_a_compiler_may_write_any_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """As in a language whose letters are not in UTF-8."""
-    says = r"printf 'Warnung \374\n' >&2"
-    monkeypatch.setenv("CXX", script(tmp_path, f'{says}; cp "{torch._C.__file__}" "$last"'))
-    assert isinstance(library.load(torch.float32), ctypes.CDLL)
-    monkeypatch.setenv("CXX", script(tmp_path, f"{says}; exit 3"))
-    with pytest.raises(ValueError, match="Warnung"):
-        library.load(torch.float64)
-
-
-def no_interpreter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    script = tmp_path / "c++"
-    script.write_text("#!/no/such/interpreter\n")
-    script.chmod(0o755)
-    monkeypatch.setenv("CXX", str(script))
-
-
-def no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    no_interpreter(monkeypatch, tmp_path)
-    (tmp_path / "c++").write_bytes(b"\0 not a program")
-
-
-def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-
-
-def no_success(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("CXX", "false")
-
-
-@pytest.mark.parametrize("prevent", [no_interpreter, no_program, no_folder, no_success])
+@pytest.mark.parametrize(
+    "compiler",
+    ["#!/no/such/interpreter\n", "\0 not a program", None],
+    ids=["no interpreter", "no program", "no folder"],
+)
 def test_what_cannot_be_built_runs_eagerly(
-    prevent: Callable[..., None], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+    compiler: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    """And says why: a compiler that cannot be started or fails, or file systems that cannot be written."""
-    prevent(monkeypatch, tmp_path)
+    """And says why: a compiler that cannot be started, or file systems that cannot be written."""
+    if compiler is not None:
+        monkeypatch.setenv("CXX", script(tmp_path, ""))
+        (tmp_path / "c++").write_text(compiler)
+    else:
+        monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     warn_eager.cache_clear()
     monkeypatch.setattr(library, "family", lambda: None)
     assert_identical(*(robot(5, backend=name).step(lively(5)) for name in ("auto", "eager")))
@@ -174,35 +153,28 @@ def test_threads_compile_once(quick_compiler: None, tmp_path: Path) -> None:
     assert runs(tmp_path) == 1 and len(set(map(id, libraries))) == 1
 
 
-def test_another_checkout_finds_the_file(quick_compiler: None, tmp_path: Path) -> None:
-    for folder in (tmp_path / "one", tmp_path / "two"):
+def test_what_makes_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Other sources, headers, options, flags and processors; not the folder that they lie in."""
+    first, second = tmp_path / "one", tmp_path / "two"
+    for folder in (first, second):
         folder.mkdir()
         (folder / "a.cpp").write_text("// the same")
+
+    def runs_after_building(*options: str, folder: Path = first) -> int:
         forget()
-        library.build(folder / "a.cpp", "-DA")
-    assert runs(tmp_path) == 1
+        library.build(folder / "a.cpp", *options)
+        return runs(tmp_path)
 
-
-def test_another_source_or_header_is_another_file(quick_compiler: None, tmp_path: Path) -> None:
-    folder = tmp_path / "sources"
-    folder.mkdir()
-    for name, text in (("a.cpp", "// one"), ("a.cpp", "// two"), ("b.hpp", "// included")):
-        (folder / name).write_text(text)
-        forget()
-        library.build(folder / "a.cpp", "-DA")
-    assert runs(tmp_path) == 3
-
-
-def test_another_processor_or_option_is_another_file(
-    quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    library.load(torch.float32)
-    for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
-        monkeypatch.setattr(library, name, value)
-        forget()
-        library.load(torch.float32)
-    assert runs(tmp_path) == 3
-    assert len(list((tmp_path / "cache" / "torchmpm").iterdir())) == 3
+    assert runs_after_building("-DA") == runs_after_building("-DA", folder=second) == 1
+    (first / "a.cpp").write_text("// another")
+    assert runs_after_building("-DA") == 2
+    (first / "b.hpp").write_text("// included")
+    assert runs_after_building("-DA") == 3
+    assert runs_after_building("-DB") == 4
+    monkeypatch.setattr(library, "processor", lambda: "another processor")
+    assert runs_after_building("-DB") == 5
+    monkeypatch.setattr(library, "_FLAGS", ("-O0",))
+    assert runs_after_building("-DB") == 6
 
 
 def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ import pytest
 import scenes
 import torch
 from native_scenes import solvers
-from scenes import normal, robot
-from test_native_adjoint import Leaves, compare_gradients, gradients, state_leaves
+from scenes import Leaves, normal, robot
+from test_native_adjoint import compare_gradients, gradients, state_leaves
 
 from torchmpm import Body, Snow, Solver
 from torchmpm.backends import compiler_found

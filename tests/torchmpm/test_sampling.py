@@ -25,16 +25,6 @@ def tolerance(kind_scale: float) -> float:
     return 5.0 * kind_scale / math.sqrt(COUNT)
 
 
-def test_sobol_numbers_fill_the_unit_square() -> None:
-    numbers = sampling.sobol(COUNT, 0)
-    assert numbers.shape == (COUNT, 2)
-    assert numbers.dtype == np.float64
-    assert 0 <= numbers.min() and numbers.max() < 1
-    np.testing.assert_allclose(numbers.mean(0), 0.5, atol=tolerance(12**-0.5))
-    np.testing.assert_allclose(numbers.var(0), 1 / 12, atol=tolerance(0.08))
-    assert len(np.unique(numbers, axis=0)) == COUNT
-
-
 def test_sobol_numbers_leave_no_holes() -> None:
     """1024 scrambled Sobol numbers: one in each of 32 x 32 boxes; random ones leave a third of them empty."""
 
@@ -50,13 +40,6 @@ def test_a_seed_decides_and_nothing_global_is_touched() -> None:
     first, again, other = (sampling.sobol(100, seed) for seed in (7, 7, 8))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     assert torch.equal(before, torch.get_rng_state())
-
-
-def test_box(numbers: np.ndarray) -> None:
-    points = sampling.box(numbers, (0.3, -0.2), (0.5, 0.1))
-    assert (points >= (0.3, -0.2)).all() and (points <= (0.8, -0.1)).all()
-    np.testing.assert_allclose(points.mean(0), (0.55, -0.15), atol=tolerance(0.15))
-    np.testing.assert_allclose(points.var(0), (0.25 / 12, 0.01 / 12), rtol=0.1)
 
 
 def test_disc_is_uniform(numbers: np.ndarray) -> None:

@@ -42,14 +42,6 @@ def test_clamp_against_svd(cutoff: float) -> None:
     np.testing.assert_allclose(squeezed[0].numpy(), [e[1] for e in expected], rtol=1e-13)
 
 
-def test_shear_cutoff_forgets_small_shear_only() -> None:
-    small, large = (torch.tensor([[[[1.0, s], [s, 1.0]]]], dtype=torch.float64) for s in (0.9e-5, 1.1e-5))
-    Jp = torch.ones(1, 1, dtype=torch.float64)
-    for F, kept in ((small, 0.0), (large, 1.1e-5)):
-        assert matrix(soil().return_map(planes(F), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(kept, abs=1e-15)
-    assert matrix(soil(shear_cutoff=0.0).return_map(planes(small), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(0.9e-5)
-
-
 @pytest.mark.parametrize(("Jp", "factor"), [(1.0, 1.0), (0.9, math.e), (0.5, 5.0), (1.1, 1 / math.e), (2.0, 0.1)])
 def test_hardening(Jp: float, factor: float) -> None:
     F = deformations(10, LOW, HIGH, seed=5, share_inverted=0.0)

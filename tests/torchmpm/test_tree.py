@@ -1,13 +1,11 @@
-"""States as pytrees: mapping, selection, and the transforms of torch that take them."""
+"""States as pytrees: mapping, selection, and the transforms of torch.func that take them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import pytest
 import torch
 from scenes import assert_identical, lively, robot
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from torchmpm import ParticleState, tree
 
@@ -39,13 +37,6 @@ def test_map_reaches_every_tensor_of_nested_containers() -> None:
     assert len(tree.leaves(doubled)) == 7
 
 
-def test_map_takes_trees_of_one_structure() -> None:
-    both = tree.map(torch.add, nested(1), nested(2))
-    assert torch.equal(both.state.x, nested(1).state.x + nested(2).state.x)
-    with pytest.raises(ValueError, match="mismatch"):
-        tree.map(torch.add, nested(1), nested(2).state)
-
-
 def test_where_selects_whole_batch_elements() -> None:
     mixed = tree.where(torch.tensor([True, False, True]), nested(1), nested(2))
     assert_identical(mixed.state[[0, 2]], nested(1).state[[0, 2]])
@@ -75,10 +66,3 @@ def test_vmap_maps_over_states_and_returns_them() -> None:
     for index, state in enumerate(states):
         alone = robot(5).step(state, substeps=2)
         torch.testing.assert_close(together.x[index], alone.x, rtol=1e-12, atol=1e-12)
-
-
-def test_checkpoints_replay_functions_of_states() -> None:
-    state = tree.map(lambda tensor: tensor.clone().requires_grad_(), lively(5))
-    plain = torch.autograd.grad(loss(state), state.F)[0]
-    replayed = torch.autograd.grad(checkpoint(loss, state, use_reentrant=False), state.F)[0]
-    assert torch.equal(plain, replayed)
