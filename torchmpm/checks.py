@@ -105,7 +105,7 @@ def pair(name: str, given: Any, *, above: float | None = None) -> None:
 def instance(name: str, given: Any, kind: type) -> None:
     """Raise a TypeError unless an object is of a type."""
     if not isinstance(given, kind) or isinstance(given, type):
-        raise TypeError(f"{name} must be a {kind.__name__}, got {_brief(given)}")
+        raise TypeError(f"{name} must be of type {kind.__name__}, got {_brief(given)}")
 
 
 def instances(name: str, given: Any, kind: type) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfp.config import EVALUATION_SEED, WindowConfig
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import DIVERGED, TorchVecEnv, first_limits
+from cfp.envs.vec_env import DIVERGED, NO_REWARD, TorchVecEnv, first_limits
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.resumable import Resumable
 from dittogym import TorchEnv, core
@@ -270,7 +270,7 @@ class WindowCollector(Resumable):
             The window; None if ``after_step`` ended it.
 
         Raises:
-            NonFiniteError: Actions are not finite.
+            NonFiniteError: Actions or rewards are not finite.
             ConfigError: A GPU has too little free memory for the gradients of a window.
         """
         env, true_reward = self.env, 0.0
@@ -296,6 +296,8 @@ class WindowCollector(Resumable):
             outcome = self.episodes.read(is_over, terminated, info["finite"], **further)
             if not outcome.values["acts"]:
                 raise NonFiniteError(DIVERGED)
+            if not np.isfinite(outcome.values["true_reward"]):
+                raise NonFiniteError(NO_REWARD)
             true_reward += float(outcome.values["true_reward"])
             infos = self.episodes.infos(outcome)
             if outcome.values["done"].any():

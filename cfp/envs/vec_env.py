@@ -21,6 +21,8 @@ from torchmpm import checks, tree
 
 #: What is wrong with actions that are not finite.
 DIVERGED = "an action is not finite: the policy has diverged"
+#: What is wrong with rewards that are not finite; where the simulation is not, the reward is a number.
+NO_REWARD = "a reward is not finite: the reward function of the task returned NaN or an infinite number"
 
 
 class TorchVecEnv(VecEnv):

@@ -109,7 +109,7 @@ def make_spec(
         signature.bind(**options)
     except TypeError as error:  # in Python's words, which programs that try out options look for
         known = ", ".join(("body", "obstacles", *signature.parameters))
-        raise TypeError(f"task {name!r} {error}; its options are {known}, beside those of TorchEnv") from error
+        raise TypeError(f"task {name!r} {error}; its options are {known}, besides those of TorchEnv") from error
     spec = make(**options)
     if obstacles is not None:
         obstacles = [from_values(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles

@@ -329,7 +329,7 @@ TYPES = [
     ("make", lambda: register(lambda: None)),
     ("'pull'", lambda: register(lambda pull: spec())),
     ("weights", lambda: spec(weights=1.0)),
-    ("obstacles[0]", lambda: spec(obstacles=(VelocityRule("-y"),))),
+    ("obstacles[0] must be of type Obstacle", lambda: spec(obstacles=(VelocityRule("-y"),))),
     ("obstacles", lambda: spec(obstacles=floor())),
     ("initial_task_state", lambda: spec(initial_task_state="peak")),
     ("reward_fn", lambda: env(task=spec(reward_fn=lambda transition, spec: None))),

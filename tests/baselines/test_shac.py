@@ -176,7 +176,7 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     learner, path = make(), tmp_path / "policy.safetensors"
     with pytest.raises(ValueError, match="got 'kick'"):
         learner.trained_policy.attached(TorchEnv("kick", 1, particles=100))
-    with pytest.raises(TypeError, match="env must be a TorchEnv, got"):
+    with pytest.raises(TypeError, match="env must be of type TorchEnv, got"):
         learner.trained_policy.attached(Env("run", particles=100))
     learner.save_policy(path, describe_run(learner.config, "shac", 1, 0))
     path.write_bytes(path.read_bytes().replace(b"inputs", b"output"))

@@ -60,6 +60,18 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path)
         update(learner)
 
 
+def undefined(transition, spec):
+    return Reward({"far": (transition.start.com[:, 1] - transition.now.com[:, 1] - 1.0).sqrt()})  # of a negative number
+
+
+def test_a_reward_that_is_not_finite_ends_the_training(monkeypatch, tmp_path):
+    spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=undefined, weights={"far": 1.0})
+    monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
+    learner = CFPAnalytic.create(replace(make(reward="task"), task="nan"), 1, tmp_path)
+    with pytest.raises(NonFiniteError, match="the reward function of the task returned NaN"):
+        update(learner)
+
+
 def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
     for train_dt, expected in ((2e-4, (2e-4, 2)), (None, (1e-4, 4))):
         model = CFPAnalytic.create(make(train_dt=train_dt), 1, tmp_path).simulation.model

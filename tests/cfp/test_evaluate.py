@@ -10,7 +10,7 @@ import torch
 from fakes import FakeEnv
 
 from cfp import messages
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluate import Command
 from cfp.evaluation.page import headline
 from cfp.evaluation.returns import Played, Result, Trial, UntrainedPolicy, evaluate, explain, make_trial
@@ -149,6 +149,11 @@ def test_an_episode_that_fails_ends_the_others():
     finally:
         torch.set_num_threads(threads)
     assert threading.active_count() == before and policies[0].steps < 10**6
+
+
+def test_a_reward_that_is_not_finite_ends_an_evaluation():
+    with pytest.raises(NonFiniteError, match="the reward function of the task returned NaN"):
+        evaluate([fake_trial(Counting(), 2, faults={3: "reward"})])
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():

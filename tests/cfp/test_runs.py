@@ -12,7 +12,7 @@ from tiny_runs import TINY, assert_same_run
 from watching import at_step, interrupt
 
 import cfp
-from cfp import registry, train
+from cfp import messages, registry, train
 from cfp.policy import read_policy
 from cfp.tables import read_table
 
@@ -59,6 +59,13 @@ def test_a_training_is_quiet_if_asked_to_and_can_be_ended_by_its_evaluations(fin
     assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
     assert_same_run(folder, finished)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_short_training_shows_no_bar_where_there_is_no_terminal(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(messages, "SELDOM", 100.0)
+    short = {"resolutions": [4], "handover": [], "eval_every": 10, "eval_episodes": 1}
+    cfp.fit("shapematch", steps=20, out=tmp_path / "run", **OPTIONS | short)
+    assert capsys.readouterr().err == ""
 
 
 class Bare:
