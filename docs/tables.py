@@ -86,8 +86,8 @@ def estimate(row: Row) -> str:
     return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
 
 
-#: Tasks whose policy was preferred to another one by five of its episodes from its own start, which flatters them.
-CHOSEN_ON_OWN_START = ("dig", "obstacle")
+#: Tasks whose policy was preferred to others by episodes from its own start that are in the table, which flatters them.
+CHOSEN_ON_OWN_START = ("dig", "obstacle", "shapematch")
 
 
 def compared(row: Row, theirs: int) -> str:
@@ -318,6 +318,14 @@ def refined_run() -> str:
     return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), lines)
 
 
+def weight_averages() -> str:
+    """Returns and success of means of policies of SHAPE MATCH, by the weights of the policies."""
+    index = "varied", "successful", "successful then varied"
+    cells = [row | {"cell": f"{estimate(row)}, {share(row['success'])}"} for row in read("weight-averages.csv")]
+    heads, lines = pivot(cells, index, ("case", "particles"), "cell")
+    return markdown((*index, *(", ".join(head) for head in heads)), lines)
+
+
 def rewards_long() -> str:
     """Highest evaluation of trainings from rewards over at least 60,000 steps, and the mean of their last three."""
     cells = []
@@ -542,6 +550,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "rewards-long": rewards_long,
     "tasks": tasks,
     "verification": verification,
+    "weight-averages": weight_averages,
 }
 
 

@@ -254,7 +254,7 @@ def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     assert address in capsys.readouterr().out
     played = Session(**program.options(tyro.cli(program.Command, args=arguments)))
     assert (played.env.spec.name, played.policy_name) == ("shapematch", "shapematch")
-    assert list(played.policies) == ["shapematch", "shapematch-success"] and played.env.action_resolution == 32
+    assert list(played.policies) == ["shapematch"] and played.env.action_resolution == 32
     assert not played.env.spec.target[40, 20]
     with socket.create_server(("127.0.0.1", 0)) as other:
         for text, message in (
