@@ -17,6 +17,7 @@ PROGRAMS = {
     "distill": ("baselines.train", "--algo distill " + SMALL + " --train-particles 100" + NEW),
     "evaluate": ("cfp.evaluate", "--device cpu "),
     "disturb": ("cfp.robustness", "--device cpu "),
+    "play": ("cfp.play.__main__", "--particles 200 "),
     "compare": ("baselines.compare.__main__", NEW),
     "rank": ("baselines.leaderboard", NEW),
 }
@@ -49,6 +50,12 @@ def planned(plan, *words):
         *words,
         module="baselines.compare.__main__",
     )
+
+
+def started(options, *words):
+    """A training that starts from the policy of a run."""
+    start = " --start-from {folder}/run "
+    return laid(f"train after a run {options}", lambda desk: desk.run(), TINY + NEW + start + options, *words)
 
 
 TRAIN = [
@@ -87,6 +94,9 @@ TRAIN = [
     laid("train into a file", lambda desk: desk.file("new", "mine"), TINY + NEW, "out must be a folder, got the file"),
     laid("train into a run", lambda desk: desk.run(), TINY + " --out {folder}/run", "out: run already holds a run"),
     laid("train under a file", lambda desk: desk.file("new", "mine"), TINY + " --out {folder}/new/run", "out: new/run"),
+    started("--refine --resolutions 8 16", "start_from must be a policy of the first resolutions of (8, 16)"),
+    started("--refine --encoder paper", "start_from must be a policy with encoder paper, got small"),
+    started("--target T", "start_from must be a policy for the target T, got the default"),
     laid("train into a loop", lambda desk: desk.link("loop"), TINY + " --out {folder}/loop", "out: loop cannot be"),
 ]
 
@@ -143,8 +153,15 @@ OTHERS = (
         ("--policy alchemy", "no shipped one has that name"),
         ("--policy alchemy --video new/a.webp", "no shipped one has that name"),
         ("--policy run --record /dev/null/a.npz", "record: "),
+        ("--policy run --record a.h5", "record must end in .npz, got a.h5"),
+        ("--policy run --record-fields x", "record_fields requires record"),
+        ("--policy run --video a.html", "video must end in .mp4 or .gif or .webp or .png, got a.html"),
+        ("--policy run --replay a.mp4", "replay must end in .html, got a.mp4"),
+        ("--policy run --video a.mp4 --size 3", "size must be at least 16, got 3"),
         ("--policy run --size 100", "size requires a file"),
         ("--policy run --replay a.html --zoom 3", "zoom requires a file"),
+        ("--policy run --dt 0.0003", "dt must divide an environment step"),
+        ("--policy run --dt 0", "dt must be positive"),
         ("--policy run --episodes 0", "episodes must be at least 1, got 0"),
         (f"--policy run --episodes 1{'0' * 400}", "episodes must be below 2**63"),
         ("--policy run --device abacus", "device must be 'cpu' or 'cuda', got 'abacus'"),
@@ -157,6 +174,16 @@ OTHERS = (
         ("run --cases earthquake", "cases must be words of"),
         ("run --episodes 0", "episodes must be at least 1, got 0"),
         ("run --rows {folder}", "rows: "),
+    )
+    + rows(
+        "play",
+        ("fly", "task must be one of"),
+        ("run --target star", "'target'"),
+        ("run --policy nowhere", "there is no policy"),
+        ("run --particles 0", "particles must"),
+        ("run --body nowhere.png", "no such file"),
+        ("run --port 99999", "port must"),
+        ("run --root-path example.org/user", "root_path must"),
     )
     + rows(
         "compare",
@@ -173,18 +200,19 @@ OTHERS = (
         ("none.json", "none.json: cannot be read as JSON"),
     )
     + [
+        laid(
+            "evaluations in another table",
+            lambda desk: desk.file("other.csv", "step,mean\n1,2\n"),
+            "run --rows {folder}/other.csv --device cpu",
+            "rows: other.csv must be a table with the columns protocol, task",
+            module="cfp.robustness",
+        ),
         planned([1], "plan: plan.json cannot be read as JSON"),
         planned({"colour": 1}, "must hold common, tasks and algos only, got colour"),
         planned({"common": {"seed": 5}}, "plan: common must not hold seed"),
         planned({"algos": {"cfp-sac": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp-sac.t"),
         planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "colour"),
         planned({"algos": {"zero": {"steps": 5}}}, "steps must not be under algos.zero, which is not trained"),
-        Case(
-            "evaluate an empty folder",
-            command(main_of("cfp.evaluate"), "{folder}"),
-            ("there is no run",),
-            Refused,
-        ),
     ]
 )
 

