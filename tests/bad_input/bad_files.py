@@ -17,6 +17,7 @@ import cfp.evaluate
 import cfp.train
 from cfp.errors import CheckpointError
 from cfp.policy import read_policy, write_policy
+from cfp.train import from_python
 from dittogym import make_spec
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -139,16 +140,16 @@ POLICIES = [
 ]
 
 
-def fits(algo, *rows):
-    """Trainings of RUN with these options from Python."""
+def options_of(algo, *rows):
+    """Options of a training of RUN, as `cfp.fit` reads them."""
     return table(
-        (f"{algo}, {words[0]}", partial(cfp.fit, **{"task": "run", "algo": algo} | options), words)
+        (f"{algo}, {words[0]}", partial(from_python, {"task": "run", "algo": algo} | options, None, False), words)
         for options, *words in rows
     )
 
 
-FITS = [
-    *fits(
+OPTIONS = [
+    *options_of(
         "cfp-analytic",
         ({"gama": 0.9}, "gama is not an option"),
         ({"particles": "few"}, "particles must be of type", "got 'few'"),
@@ -156,11 +157,6 @@ FITS = [
         ({"steps": 96, "num_envs": 2, "window": 32, "handover": (0.5,)}, "every stage at least 64 steps"),
         ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the other learner only
         ({"warmup": 3, "task": "nowhere"}, "task must be", "got 'nowhere'"),
-        ({"out": ""}, "out must name a folder, got ''"),
-        ({"out": b"run"}, "out must name a folder, got b'run'"),
-        ({"out": Path(__file__)}, "out must be a folder, got the file"),
-        ({"resume": "x", "out": "new"}, "resume"),
-        ({"on_evaluation": 3, "out": "new"}, "on_evaluation"),
         ({"window": 0}, "window must be at least 1, got 0"),
         ({"action_step": [0.0]}, "action_step must be positive, got 0"),
         ({"weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
@@ -168,7 +164,7 @@ FITS = [
         ({"vary_start": 0.0}, "vary_start requires vary"),
         ({"train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
     ),
-    *fits(
+    *options_of(
         "cfp-sac",
         ({"steps": True}, "steps must be of type int"),
         ({"video": 1}, "video must be of type bool"),
@@ -202,6 +198,22 @@ FITS = [
         ({"vary_start": -1.0}, "vary_start must be at least 0, got -1.0"),
     ),
 ]
+
+
+FITS = table(
+    (f"fit with {options}", partial(cfp.fit, "run", **options), words)
+    for options, words in (
+        ({"out": ""}, "out must name a folder, got ''"),
+        ({"out": b"run"}, "out must name a folder, got b'run'"),
+        ({"out": Path(__file__)}, "out must be a folder, got the file"),
+        ({"resume": "x", "out": "new"}, "resume"),
+        ({"on_evaluation": 3, "out": "new"}, "on_evaluation"),
+    )
+)
+PRESETS = table(
+    (f"preset {' '.join(words)}", partial(cfp.preset, "run", *words), named)
+    for words, named in ((("paper", "cfp-analytic"), "preset"), (("quick", "ppo"), "algo"), (("slow",), "preset"))
+)
 
 
 def resumed(name, change, *words):
@@ -326,4 +338,4 @@ CONFIGS = [
     ),
 ]
 
-CASES = [*IMAGES, *POLICIES, *FITS, *RUNS, *CONFIGS]
+CASES = [*IMAGES, *POLICIES, *OPTIONS, *FITS, *PRESETS, *RUNS, *CONFIGS]

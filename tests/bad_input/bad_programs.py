@@ -17,7 +17,6 @@ PROGRAMS = {
     "distill": ("baselines.train", "--algo distill " + SMALL + " --train-particles 100" + NEW),
     "evaluate": ("cfp.evaluate", "--device cpu "),
     "disturb": ("cfp.robustness", "--device cpu "),
-    "play": ("cfp.play.__main__", "--particles 200 "),
     "compare": ("baselines.compare.__main__", NEW),
     "rank": ("baselines.leaderboard", NEW),
 }
@@ -174,16 +173,6 @@ OTHERS = (
         ("run --cases earthquake", "cases must be words of"),
         ("run --episodes 0", "episodes must be at least 1, got 0"),
         ("run --rows {folder}", "rows: "),
-    )
-    + rows(
-        "play",
-        ("fly", "task must be one of"),
-        ("run --target star", "'target'"),
-        ("run --policy nowhere", "there is no policy"),
-        ("run --particles 0", "particles must"),
-        ("run --body nowhere.png", "no such file"),
-        ("run --port 99999", "port must"),
-        ("run --root-path example.org/user", "root_path must"),
     )
     + rows(
         "compare",

@@ -6,7 +6,6 @@ import pytest
 import torch
 from policy_files import save_actor
 
-import cfp
 import dittogym
 from cfp.agent.actor import build_actor
 from cfp.analytic.window import Episodes
@@ -52,15 +51,6 @@ def test_paper_presets_hold_the_published_numbers():
         assert (config.buffer_size, config.gradient_steps, config.update_start) == (200_000, 1, 256)
         assert config.variant == ("published" if task == "slot" else None)
         assert config.seed == {"catch": 2, "slot": 1}.get(task, 0)
-
-
-def test_quick_learns_by_gradients_and_paper_from_rewards():
-    algos = [cfp.preset("run", *words).algo for words in ((), ("long",), ("paper",), ("quick", "cfp-sac"))]
-    assert algos == ["cfp-analytic", "cfp-sac", "cfp-sac", "cfp-sac"]
-    for words, named in ((("paper", "cfp-analytic"), "preset"), (("quick", "ppo"), "algo"), (("slow",), "preset")):
-        with pytest.raises(ConfigError, match=named):
-            cfp.preset("run", *words)
-    assert cfp.preset("run").name == "cfp-analytic-run-quick-0"
 
 
 def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):

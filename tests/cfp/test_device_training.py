@@ -4,16 +4,15 @@ that do not wait for it, the options of a GPU, and runs that change their device
 
 import copy
 import json
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
+from device_operators import DeviceOperators
 from fakes import FakeEnv
 from stable_baselines3.common.logger import Logger
 from tiny_runs import resume, run
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from cfp import CFP, CFPPolicy, registry, train
 from cfp.agent.actor import ActorSpec, build_actor
@@ -44,44 +43,18 @@ def make_model(tensors=True, env=None, cls=CFP, **options):
     return model
 
 
-class Waits(TorchDispatchMode):
-    """Notes the operators for which a GPU would have to be waited for: those that give the host a number or a size."""
-
-    NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero", "item")
-
-    def __init__(self):
-        super().__init__()
-        self.found = []
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        name = function.overloadpacket.__name__
-        indices = args[1] if name.startswith("index") and len(args) > 1 and isinstance(args[1], list | tuple) else ()
-        masked = any(isinstance(index, torch.Tensor) and index.dtype == torch.bool for index in indices)
-        if any(part in name for part in self.NAMES) or masked:
-            self.found.append(name)
-        return function(*args, **(kwargs or {}))
-
-
-@contextmanager
-def nothing_read(monkeypatch):
-    """Nothing is waited for, and no tensor becomes an array or a list, in this block."""
-    with monkeypatch.context() as patch, Waits() as waits:
-        for name in ("numpy", "tolist", "cpu", "__array__"):
-            patch.setattr(torch.Tensor, name, lambda *_, name=name: pytest.fail(f"Tensor.{name} waits for a GPU"))
-        yield
-    assert waits.found == []
-
-
-def test_an_update_of_soft_actor_critic_waits_for_nothing(monkeypatch):
+def test_an_update_of_soft_actor_critic_waits_for_nothing():
     model = make_model()
     model.learn(30)
-    with nothing_read(monkeypatch):
+    with DeviceOperators() as device:
         model.train(3, 8)
-    with pytest.raises(pytest.fail.Exception, match="tolist"), nothing_read(monkeypatch):
+    assert not device.waits
+    with DeviceOperators() as device:
         model.read_updates()
+    assert device.waits
 
 
-def test_updates_by_gradients_wait_for_nothing(monkeypatch):
+def test_updates_by_gradients_wait_for_nothing():
     actor, critic = build_actor(SPEC), mlp(5, 1)
     actor.fix_std()
     memory = ImageMemory(12, (torch.zeros(3, 64, 64, dtype=torch.uint8), torch.zeros(4, 8, 8)))
@@ -92,13 +65,13 @@ def test_updates_by_gradients_wait_for_nothing(monkeypatch):
         adam.param_groups[0]["fused"] = True  # as on a GPU; others count their steps on the host
     seen = Window(torch.randn(4, 3, 5), torch.randn(4, 3), torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.bool), 0.0)
     regression.update(*memory.sample(4, generator), 1e-3)
-    with nothing_read(monkeypatch):
+    with DeviceOperators() as device:
         for _ in range(3):
             regression.update(*memory.sample(4, generator), 1e-3)
-    waits = Waits()
-    with waits:
+    assert not device.waits
+    with DeviceOperators() as device:
         values.update(seen, 1e-3)
-    assert len(waits.found) == 2  # whether the gradients were finite, and the loss to log, once a window
+    assert device.waits.total() == 2  # whether the gradients were finite, and the loss to log, once a window
 
 
 def test_training_on_the_device_stores_and_returns_what_arrays_do():

@@ -19,17 +19,16 @@ from cfp.tables import read_table
 pytestmark = pytest.mark.usefixtures("short")
 
 
-@pytest.fixture(scope="module")
-def coarse(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "coarse"
-    assert run(folder, *ONE_STAGE, "--steps", "30") == 0
-    return folder
+@pytest.fixture
+def coarse(finished):
+    """The policy of a first stage."""
+    return finished / "stage1.safetensors"
 
 
 def test_second_stage_starts_from_a_policy(coarse, tmp_path):
     folder = tmp_path / "fine"
     assert run(folder, "--start-from", str(coarse), "--steps", "100", "--handover", "0.7") == 0
-    assert json.loads((folder / "stage1.json").read_text()) == json.loads((coarse / "policy.json").read_text())
+    assert json.loads((folder / "stage1.json").read_text()) == json.loads(coarse.with_suffix(".json").read_text())
     assert {row["stage"] for row in read_table(folder / "progress.csv")} == {"2"}
     assert read_table(folder / "progress.csv")[0]["step"] == "80"  # its steps go on from the handover
     actor, frozen = (cfp.load(place).actor.state_dict() for place in (folder, coarse))

@@ -271,17 +271,13 @@ def test_reward_that_is_not_finite_is_never_stored():
     assert np.isfinite(model.replay_buffer.rewards).all()
 
 
-@pytest.mark.parametrize("of", ["loss", "gradient"])
-def test_what_is_not_finite_changes_no_weight(of):
-    model, batch = make_model(ActorSpec((8,))), make_batch(8)
+def test_gradient_that_is_not_finite_changes_no_weight():
+    model = make_model(ActorSpec((8,)))
     _, critic, _ = model.networks()
     before = {name: value.clone() for name, value in critic.state_dict().items()}
-    if of == "loss":
-        batch = batch._replace(rewards=batch.rewards * float("nan"))
-    else:
-        next(critic.parameters()).register_hook(lambda gradient: gradient * float("inf"))
-    with pytest.raises(NonFiniteError, match=r"critic loss (nan|\d.*) or its gradient is not finite"):
-        model.update(batch)
+    next(critic.parameters()).register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(NonFiniteError, match=r"critic loss \d.* or its gradient is not finite"):
+        model.update(make_batch(8))
     assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
 
 
