@@ -10,6 +10,7 @@ import torch
 from fakes import FakeEnv
 
 from cfp import messages
+from cfp.errors import ConfigError
 from cfp.evaluate import Command
 from cfp.evaluation.page import headline
 from cfp.evaluation.returns import Played, Result, Trial, UntrainedPolicy, evaluate, explain, make_trial
@@ -100,18 +101,15 @@ def test_trials_on_a_gpu_are_played_one_at_a_time(monkeypatch):
 
 
 def test_noise_differs_between_layouts_and_steps():
-    class Recorder(LinearPolicy):
-        def __init__(self):
-            super().__init__()
-            self.drawn = []
+    drawn = []
 
+    class Recorder(Counting):
         def predict(self, *arguments, **options):
-            self.drawn.append(torch.randn(3))
+            drawn.append(torch.randn(3))
             return super().predict(*arguments, **options)
 
-    policy = Recorder()
-    evaluate([fake_trial(policy, 3)])
-    assert len(policy.drawn) == 12 and len(torch.stack(policy.drawn).unique(dim=0)) == 12
+    evaluate([fake_trial(Recorder(), 3)])
+    assert len(drawn) == 12 and len(torch.stack(drawn).unique(dim=0)) == 12
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -153,6 +151,9 @@ def test_an_episode_that_fails_ends_the_others():
 def test_a_policy_can_be_evaluated_with_other_substeps():
     config, _ = Command(policy="run", dt=2e-4).open()
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
+    for dt, message in ((3e-4, "dt must divide an environment step"), (0.0, "dt must be positive")):
+        with pytest.raises(ConfigError, match=f"^{message}"):
+            Command(policy="run", dt=dt).open()
 
 
 def test_the_seed_chooses_the_episodes():

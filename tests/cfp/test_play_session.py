@@ -175,10 +175,7 @@ def test_policies_with_other_orientations_and_gates() -> None:
     fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
     played = session(policies={"fine": lambda: fine}, policy="fine")
     played.advance()
-    images = played.observation.numpy()
     assert shown(played).gate.shape == (2, 16, 16) and shown(played).gate.any()
-    action, gate = fine.predict_with_gate(images, True)
-    assert np.array_equal(action, fine.predict(images, deterministic=True)[0]) and gate.shape == (1, 2, 16, 16)
 
 
 def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:

@@ -7,13 +7,12 @@ import cv2
 import matplotlib
 import pytest
 from short_episodes import HORIZON
-from tiny_runs import TINY, assert_same_run
+from tiny_runs import TABLES, assert_same_run
 from watching import at_step, interrupt
 
 import cfp
-from cfp import registry, train
+from cfp import registry
 from cfp.policy import read_policy
-from cfp.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("short")
 
@@ -26,37 +25,29 @@ OPTIONS = {
 }
 
 
-def test_fit_is_the_command_line_and_resumes_after_ctrl_c(tmp_path):
-    folder = tmp_path / "run"
-    assert train.from_python({"task": "shapematch", "steps": 150, **OPTIONS}, None, False).run == train.parse(TINY).run
-    short = {"eval_every": 0, "eval_episodes": 1, "resolutions": [4], "handover": []}
-    with at_step(14, interrupt), pytest.raises(KeyboardInterrupt, match="resume=True"):
-        cfp.fit("shapematch", steps=30, out=folder, **OPTIONS | short)
-    run = cfp.fit("shapematch", steps=30, out=str(folder), resume=True, **OPTIONS | short)
-    assert [row["step"] for row in read_table(folder / "progress.csv")] == ["10", "20", "30"]
-    assert run.folder == folder and run.policy.description["steps"] == 30
-
-
 class Pruned(Exception):
     """As a library that searches for options raises it to end a training that does not look promising."""
 
 
-def test_a_training_is_quiet_if_asked_to_and_can_be_ended_by_its_evaluations(finished, tmp_path, capfd):
-    rows = []
+def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finished, tmp_path, capfd):
+    """After Ctrl-C, and after an exception that its evaluations have led to; quietly if asked to."""
+    folder, rows = tmp_path / "run", []
 
     def prune(row):
         rows.append(row)
         if row["step"] == 120:
             raise Pruned
 
-    folder = tmp_path / "run"
+    with at_step(14, interrupt), pytest.raises(KeyboardInterrupt, match="resume=True"):
+        cfp.fit("shapematch", steps=150, out=str(folder), **OPTIONS)
+    capfd.readouterr()
     with pytest.raises(Pruned):
-        cfp.fit("shapematch", steps=150, out=folder, quiet=True, on_evaluation=prune, **OPTIONS)
+        cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=prune, **OPTIONS)
     assert [(row["step"], row["stage"]) for row in rows] == [(60, 1), (70, 1), (70, 2), (120, 2)]
     assert not (folder / "results.json").exists()
     run = cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=rows.append, **OPTIONS)
     assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
-    assert_same_run(folder, finished)
+    assert_same_run(folder, finished, (*TABLES, "policy.safetensors", "config.json"))
     assert capfd.readouterr() == ("", "")
 
 
