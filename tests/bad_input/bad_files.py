@@ -140,7 +140,7 @@ POLICIES = [
 ]
 
 
-def options_of(algo, *rows):
+def training_options(algo, *rows):
     """Options of a training of RUN, as `cfp.fit` reads them."""
     return table(
         (f"{algo}, {words[0]}", partial(from_python, {"task": "run", "algo": algo} | options, None, False), words)
@@ -149,7 +149,7 @@ def options_of(algo, *rows):
 
 
 OPTIONS = [
-    *options_of(
+    *training_options(
         "cfp-analytic",
         ({"gama": 0.9}, "gama is not an option"),
         ({"particles": "few"}, "particles must be of type", "got 'few'"),
@@ -164,7 +164,7 @@ OPTIONS = [
         ({"vary_start": 0.0}, "vary_start requires vary"),
         ({"train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
     ),
-    *options_of(
+    *training_options(
         "cfp-sac",
         ({"steps": True}, "steps must be of type int"),
         ({"video": 1}, "video must be of type bool"),

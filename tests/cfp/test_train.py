@@ -8,6 +8,7 @@ import shutil
 import signal
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -91,12 +92,11 @@ def test_the_end_of_a_run_names_an_earlier_stage_that_returns_more(finished, tmp
     assert named(zero_action=0.0, random_action=0.0, stage_1=1.0, stage_2=2.0) == []
 
 
-@pytest.mark.parametrize(("learner", "within", "boundary"), [("sac", 44, 70), ("analytic", 64, 48)])
-def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(
-    learner, within, boundary, tmp_path, request, capsys
-):
+# The first stop of soft actor-critic is in its random phase; one of each learner is between the stages.
+@pytest.mark.parametrize(("learner", "stops"), [("sac", (8, 44, 70)), ("analytic", (48, 64))])
+def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(learner, stops, tmp_path, request, capsys):
     whole = request.getfixturevalue("finished" if learner == "sac" else "finished_analytic")
-    folder, stops = tmp_path / "stopped", sorted((within, boundary))
+    folder = tmp_path / "stopped"
 
     def kill():
         raise RuntimeError("killed")
@@ -104,12 +104,13 @@ def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(
     with at_step(stops[0], interrupt):
         assert run(folder, learner=learner) == 128 + signal.SIGINT
     assert "--resume" in capsys.readouterr().out
-    with at_step(stops[1], terminate):
-        assert resume(folder) == 128 + signal.SIGTERM
-    assert f"resuming {folder} at step {stops[0]}" in capsys.readouterr().out
+    for before, stop in pairwise(stops):
+        with at_step(stop, terminate):
+            assert resume(folder) == 128 + signal.SIGTERM
+        assert f"resuming {folder} at step {before}" in capsys.readouterr().out
     with at_step(88, kill), pytest.raises(RuntimeError, match="killed"):
         resume(folder)
-    assert f"resuming {folder} at step {stops[1]}" in capsys.readouterr().out
+    assert f"resuming {folder} at step {stops[-1]}" in capsys.readouterr().out
     assert resume(folder) == 0  # from its last checkpoint
     assert_same_run(folder, whole)
 
