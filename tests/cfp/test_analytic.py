@@ -115,6 +115,10 @@ def test_outlying_gradient_does_not_drown_the_others():
     assert step.limited == 1 and change.isfinite().all()
     assert 2.5 < norms[1, 2] / norms.median() < 3.5
     assert norms.min() > 0.2 * norms.median()
+    resumed, later = ActionStep(), 100 * gradients
+    resumed.load_state_dict(step.state_dict())
+    assert torch.equal(resumed(locations, later, 0.1), step(locations, later, 0.1))
+    assert not torch.equal(ActionStep()(locations, later, 0.1), step(locations, later, 0.1))
 
 
 def test_memory_keeps_the_latest_pairs_and_survives_a_checkpoint():

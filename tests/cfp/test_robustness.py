@@ -11,10 +11,9 @@ from policy_files import save_actor
 
 from cfp import robustness
 from cfp.agent.actor import build_actor
-from cfp.errors import ConfigError
 from cfp.evaluate import open_policy
 from cfp.presets import preset, sac_preset
-from cfp.robustness import DISTURBANCES, choose, effective, ratios
+from cfp.robustness import DISTURBANCES, effective, ratios
 from dittogym import TASKS, Conditions, TorchEnv, make_spec
 
 
@@ -23,14 +22,6 @@ def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out
     assert effective(make_spec("run"), True) == every
     assert effective(make_spec("shapematch"), True) == [name for name in every if "gravity" not in name]
     assert "observation dropout" not in effective(make_spec("run"), False)
-
-
-def test_disturbances_are_chosen_by_words():
-    names = effective(make_spec("shapematch"), True)
-    assert choose(names, []) == names
-    assert choose(names, ["dropout", "mu x 0.8"]) == ["action dropout", "observation dropout", "mu x 0.8"]
-    with pytest.raises(ConfigError, match=r"cases must be words of action dropout.*got 'gravity'"):
-        choose(names, ["dropout", "gravity"])
 
 
 # The command
