@@ -219,7 +219,7 @@ class ProgressBarCallback(StageCallback):
     def show(self, **values: float) -> None:
         """Show values beside the bar."""
         self.values |= {name: f"{value:.1f}" for name, value in values.items()}
-        self.bar.set_postfix(self.values)
+        self.bar.set_postfix(self.values, refresh=False)  # a bar that has not appeared would end without a new line
 
 
 class LogCallback(StageCallback):
