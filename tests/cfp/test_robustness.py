@@ -5,13 +5,16 @@ from dataclasses import replace
 from unittest import mock
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from policy_files import save_actor
+from scipy import stats
 
 from cfp import robustness
 from cfp.agent.actor import build_actor
 from cfp.evaluate import open_policy
+from cfp.evaluation.returns import Played, Result
 from cfp.presets import preset, sac_preset
 from cfp.robustness import DISTURBANCES, effective, ratios
 from dittogym import TASKS, Conditions, TorchEnv, make_spec
@@ -22,6 +25,14 @@ def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out
     assert effective(make_spec("run"), True) == every
     assert effective(make_spec("shapematch"), True) == [name for name in every if "gravity" not in name]
     assert "observation dropout" not in effective(make_spec("run"), False)
+
+
+def test_interval_is_student_s():
+    returns = np.random.default_rng(0).normal(size=5)
+    low, high = stats.t.interval(0.95, 4, returns.mean(), stats.sem(returns))
+    result = Result("", 8, tuple(Played(value, None, False, 1.0, 1.0) for value in returns))
+    assert result.interval == pytest.approx((high - low) / 2, rel=1e-5)
+    assert replace(result, episodes=result.episodes[:1]).interval is None
 
 
 # The command
