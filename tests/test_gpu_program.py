@@ -19,76 +19,59 @@ gpu = sys.modules["gpu_program"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(gpu)
 
 
-def follow(tmp_path, script, seconds=20.0):
-    """The check to go on with after a stage, and its rows in the file of results."""
-    report = gpu.Report(tmp_path / "results.json", "imitation")
-    going_on = gpu.follow([sys.executable, "-uc", script], "parity", seconds, report)
-    rows = json.loads((tmp_path / "results.json").read_text())["rows"] if report.rows else []
-    assert rows == report.rows
-    return going_on, rows
-
-
 ROW = json.dumps(
     {"stage": "parity", "check": "one", "backend": "native", "figures": {"x": 1.0}, "wrong": [], "seconds": 1}
 )
+#: A process whose first check has ended, and one that is in its second check.
+ONE = f"print('CHECK 0 one'); print('ROW ' + '''{ROW}''')"
+OTHER = f"{ONE}; print('CHECK 1 the other one')"
 
 
-def test_a_stage_that_ends_well(tmp_path):
-    going_on, rows = follow(tmp_path, f"print('CHECK 0 one'); print('some warning'); print('ROW ' + '''{ROW}''')")
-    assert going_on is None and rows == [json.loads(ROW)]
+@pytest.mark.parametrize(
+    ("script", "going_on", "checks", "wrong"),
+    [
+        (f"{ONE}; print('some warning')", None, ["one"], None),
+        (f"{OTHER}; import os; os.abort()", 2, ["one", "the other one"], "the process ended with "),
+        (f"{OTHER}; raise MemoryError('none left')", 2, ["one", "the other one"], "none left"),
+        (f"{ONE}; exit({gpu.LOST})", 1, ["one"], None),  # it has lost its context, and has written why
+        ("print('CHECK 4 slow'); import time; time.sleep(60)", 5, ["slow"], "out of time"),
+        ("import no_such_module", None, ["its start"], "No module named 'no_such_module'"),
+    ],
+    ids=["ends well", "aborts", "raises", "loses its context", "takes too long", "does not start"],
+)
+def test_a_stage_goes_on_after_the_check_in_which_its_process_has_ended(script, going_on, checks, wrong, tmp_path):
+    report, seconds = gpu.Report(tmp_path / "results.json", "imitation"), 2.0 if "sleep" in script else 20.0
+    assert gpu.follow([sys.executable, "-uc", script], "parity", seconds, report) == going_on
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    assert rows == report.rows and [row["check"] for row in rows] == checks
+    assert wrong in rows[-1]["wrong"][0] if wrong else rows == [json.loads(ROW)]
 
 
-@pytest.mark.parametrize("end", ["import os; os.abort()", "raise MemoryError('none left')"])
-def test_a_stage_that_dies_goes_on_with_the_next_check(tmp_path, end):
-    script = f"print('CHECK 0 one'); print('ROW ' + '''{ROW}'''); print('CHECK 1 the other one'); {end}"
-    going_on, rows = follow(tmp_path, script)
-    assert going_on == 2 and [row["check"] for row in rows] == ["one", "the other one"]
-    assert rows[1]["wrong"][0].startswith("the process ended with ")
+def test_checks_that_fail_are_passed_over_until_the_context_is_lost(monkeypatch, capsys):
+    """A check that ran on the eager backend in silence has failed, too."""
 
-
-def test_a_context_that_is_lost_goes_on_in_another_process(tmp_path):
-    """The row of the failure has been written already."""
-    going_on, rows = follow(tmp_path, f"print('CHECK 0 one'); print('ROW ' + '''{ROW}'''); exit({gpu.LOST})")
-    assert going_on == 1 and len(rows) == 1
-
-
-def test_a_stage_out_of_time(tmp_path):
-    going_on, rows = follow(tmp_path, "print('CHECK 4 slow'); import time; time.sleep(60)", seconds=2.0)
-    assert going_on == 5 and rows[0]["check"] == "slow" and "out of time" in rows[0]["wrong"][0]
-
-
-def test_a_stage_that_does_not_start(tmp_path):
-    going_on, rows = follow(tmp_path, "import no_such_module")
-    assert going_on is None and "No module named 'no_such_module'" in rows[0]["wrong"][0]
-
-
-def run_checks(monkeypatch, capsys, checks):
-    """Rows of a stage of these checks, and its exit code."""
-    monkeypatch.setitem(gpu.STAGES, "parity", lambda lab: iter(checks.items()))
-    code = gpu.run_stage(gpu.Lab("cpu", True, Path(), 10.0), "parity", 0)
-    return code, [json.loads(line[4:]) for line in capsys.readouterr().out.splitlines() if line.startswith("ROW ")]
-
-
-def test_a_check_that_fails_is_passed_over(monkeypatch, capsys):
-    checks = {"broken": lambda: 1 / 0, "exact": lambda: gpu.judged({"backend": "native", "x": 0.0}, {"x": 0})}
-    code, rows = run_checks(monkeypatch, capsys, checks)
-    assert code == 0 and [bool(row["wrong"]) for row in rows] == [True, False]
-    assert rows[0]["wrong"] == ["ZeroDivisionError: division by zero"]
-
-
-def test_eager_in_silence_fails(monkeypatch, capsys):
-    _, rows = run_checks(
-        monkeypatch, capsys, {"a": lambda: {"backend": "eager"}, "a, eager": lambda: {"backend": "eager"}}
-    )
-    assert [row["wrong"] for row in rows] == [["it ran on the eager backend"], []]
-
-
-def test_no_check_runs_in_a_context_that_is_lost(monkeypatch, capsys):
     def lost():
         raise RuntimeError("CUDA error: an illegal memory access was encountered")
 
-    code, rows = run_checks(monkeypatch, capsys, {"a": lost, "b": lost})
-    assert code == gpu.LOST and len(rows) == 1
+    checks = {
+        "broken": lambda: 1 / 0,
+        "exact": lambda: gpu.judged({"backend": "native", "x": 0.0}, {"x": 0}),
+        "slow": lambda: {"backend": "eager"},
+        "slow, eager": lambda: {"backend": "eager"},
+        "lost": lost,
+        "never": lost,
+    }
+    monkeypatch.setitem(gpu.STAGES, "parity", lambda lab: iter(checks.items()))
+    assert gpu.run_stage(gpu.Lab("cpu", True, Path(), 10.0), "parity", 0) == gpu.LOST
+    rows = [json.loads(line[4:]) for line in capsys.readouterr().out.splitlines() if line.startswith("ROW ")]
+    wrong = {row["check"]: row["wrong"] for row in rows}
+    assert "illegal memory access" in wrong.pop("lost")[0]
+    assert wrong == {
+        "broken": ["ZeroDivisionError: division by zero"],
+        "exact": [],
+        "slow": ["it ran on the eager backend"],
+        "slow, eager": [],
+    }
 
 
 @pytest.mark.parametrize("value", [2.0, math.nan])

@@ -115,6 +115,6 @@ def make_trained(folder: Path) -> Path:
 def table(rows, error=ValueError):
     """Cases of calls in Python: rows of a name, a call, and words of the error."""
     return [
-        Case(name, lambda desk, call=call: call(), words if isinstance(words, tuple) else (words,), error)
+        Case(name, lambda desk, call=call: call(), (words,) if isinstance(words, str) else tuple(words), error)
         for name, call, words in rows
     ]

@@ -3,6 +3,8 @@
 import json
 import struct
 import zlib
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,6 +16,8 @@ import cfp
 import cfp.evaluate
 import cfp.train
 from cfp.errors import CheckpointError
+from cfp.policy import read_policy, write_policy
+from cfp.train import from_python
 from dittogym import make_spec
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -87,17 +91,11 @@ POLICIES = [
     Case("policy missing", lambda desk: cfp.load("nobody"), ("nobody.safetensors", "grow-success"), CheckpointError),
     *(
         Case(f"policy {path!r}", lambda desk, path=path: cfp.load(path), ("path must", repr(path)), CheckpointError)
-        for path in (None, 5, b"run", "")
+        for path in (None, 5, b"run", "", "hf://runner", "hf://a/b/c", "hf://a/b@", "hf://a/b@../../x y")
     ),
     *table((f"policy onto {to!r}", lambda to=to: cfp.load("run", device=to), "device") for to in ("abacus", 1.5)),
     *table((f"policy into {to!r}", lambda to=to: cfp.load("run").save(to), "path") for to in ("run", "run.json")),
     *table((f"run of {given!r}", lambda given=given: cfp.Run(given), "folder") for given in (None, "")),
-    *table(
-        [
-            ("run resumed perhaps", lambda: cfp.fit("run", resume="x", out="new"), "resume"),
-            ("run that tells a number", lambda: cfp.fit("run", on_evaluation=3, out="new"), "on_evaluation"),
-        ]
-    ),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
@@ -142,6 +140,82 @@ POLICIES = [
 ]
 
 
+def training_options(algo, *rows):
+    """Options of a training of RUN, as `cfp.fit` reads them."""
+    return table(
+        (f"{algo}, {words[0]}", partial(from_python, {"task": "run", "algo": algo} | options, None, False), words)
+        for options, *words in rows
+    )
+
+
+OPTIONS = [
+    *training_options(
+        "cfp-analytic",
+        ({"gama": 0.9}, "gama is not an option"),
+        ({"particles": "few"}, "particles must be of type", "got 'few'"),
+        ({"handover": ()}, "handover must have 1 values"),
+        ({"steps": 96, "num_envs": 2, "window": 32, "handover": (0.5,)}, "every stage at least 64 steps"),
+        ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the other learner only
+        ({"warmup": 3, "task": "nowhere"}, "task must be", "got 'nowhere'"),
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"action_step": [0.0]}, "action_step must be positive, got 0"),
+        ({"weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
+        ({"num_layouts": 9_999}, "num_layouts must be at most 9992"),
+        ({"vary_start": 0.0}, "vary_start requires vary"),
+        ({"train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
+    ),
+    *training_options(
+        "cfp-sac",
+        ({"steps": True}, "steps must be of type int"),
+        ({"video": 1}, "video must be of type bool"),
+        ({"tau": "0.5"}, "tau must be of type float"),
+        ({"dtype": "float16"}, "dtype must be of type Literal['float32', 'float64']"),
+        ({"particles": [1.5, 2]}, "particles must be of type"),
+        ({"alpha": [0.1, "x"]}, "alpha must be of type tuple[float, ...]"),
+        ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
+        ({"gate_bias": [10**400]}, "gate_bias must be below 2**63"),
+        ({"steps": 0}, "steps must be at least 1, got 0"),
+        ({"num_envs": 10_001}, "num_envs must be at most 10000"),
+        ({"resolutions": []}, "resolutions must have at least one value"),
+        ({"resolutions": [4, 8, 16]}, "handover must have 2 values"),
+        ({"handover": [1.0]}, "handover must be shares of the steps between 0 and 1"),
+        ({"resolutions": [4, 8, 16], "handover": [0.5, 0.4]}, "steps and handover must give every stage"),
+        ({"steps": 20}, "steps and handover must give every stage at least 16 steps"),
+        ({"critics_first": [1.0]}, "critics_first must be at least 0 and less than 1, got 1"),
+        ({"noise_cells": 3}, "noise_cells must be one of"),
+        ({"noise_cells": 8}, "noise_cells must be at most 4"),
+        ({"noise_scale": [0.0, 1.0]}, "noise_scale must be positive"),
+        ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
+        ({"gamma": 1.0}, "gamma must be below 1 with several n_steps"),
+        ({"buffer_size": 20}, "buffer_size must be at least batch_size"),
+        ({"refine": True}, "refine requires start_from"),
+        ({"vary": 1.5}, "vary must be between 0 and 1, got 1.5"),
+        ({"vary_latency": -1}, "vary_latency must be at least 0, got -1"),
+        ({"vary_noise": -0.1}, "vary_noise must be at least 0, got -0.1"),
+        ({"vary_actions": 1.1}, "vary_actions must be between 0 and 1, got 1.1"),
+        ({"vary_pixels": -0.1}, "vary_pixels must be between 0 and 1, got -0.1"),
+        ({"vary_physics": 1.0}, "vary_physics must be at least 0 and less than 1, got 1.0"),
+        ({"vary_start": -1.0}, "vary_start must be at least 0, got -1.0"),
+    ),
+]
+
+
+FITS = table(
+    (f"fit with {options}", partial(cfp.fit, "run", **options), words)
+    for options, words in (
+        ({"out": ""}, "out must name a folder, got ''"),
+        ({"out": b"run"}, "out must name a folder, got b'run'"),
+        ({"out": Path(__file__)}, "out must be a folder, got the file"),
+        ({"resume": "x", "out": "new"}, "resume"),
+        ({"on_evaluation": 3, "out": "new"}, "on_evaluation"),
+    )
+)
+PRESETS = table(
+    (f"preset {' '.join(words)}", partial(cfp.preset, "run", *words), named)
+    for words, named in ((("paper", "cfp-analytic"), "preset"), (("quick", "ppo"), "algo"), (("slow",), "preset"))
+)
+
+
 def resumed(name, change, *words):
     """A run whose folder was changed before it is resumed."""
     call = prepared(lambda desk: desk.run(change), command(cfp.train.main, TINY + " --resume --out {folder}/run"))
@@ -181,6 +255,17 @@ def state(**changes):
     return change
 
 
+def described(**changes):
+    """Another description of the policy."""
+
+    def change(folder):
+        path = folder / "policy.safetensors"
+        tensors, description = read_policy(path)
+        write_policy(path, tensors, description | changes)
+
+    return change
+
+
 class Stranger:
     """What a file of pickles could hold."""
 
@@ -215,6 +300,8 @@ RUNS = [
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
     evaluated("unknown options", options(colour=1), "config.json: colour is not an option"),
     evaluated("no policy", lambda folder: (folder / "policy.safetensors").unlink(), "no policy has been written yet"),
+    evaluated("a policy for another task", described(task="run"), "policy.safetensors: stage 1 of this run", "for run"),
+    evaluated("a policy of another grid", described(resolution=16), "stage 1 of this run", "a grid of 16"),
     evaluated("a policy cut short", cut("policy.safetensors"), "policy.safetensors: the policy is damaged"),
 ]
 
@@ -251,4 +338,4 @@ CONFIGS = [
     ),
 ]
 
-CASES = [*IMAGES, *POLICIES, *RUNS, *CONFIGS]
+CASES = [*IMAGES, *POLICIES, *OPTIONS, *FITS, *PRESETS, *RUNS, *CONFIGS]

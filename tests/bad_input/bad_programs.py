@@ -51,6 +51,12 @@ def planned(plan, *words):
     )
 
 
+def started(options, *words):
+    """A training that starts from the policy of a run."""
+    start = " --start-from {folder}/run "
+    return laid(f"train after a run {options}", lambda desk: desk.run(), TINY + NEW + start + options, *words)
+
+
 TRAIN = [
     *rows(
         "train",
@@ -87,6 +93,9 @@ TRAIN = [
     laid("train into a file", lambda desk: desk.file("new", "mine"), TINY + NEW, "out must be a folder, got the file"),
     laid("train into a run", lambda desk: desk.run(), TINY + " --out {folder}/run", "out: run already holds a run"),
     laid("train under a file", lambda desk: desk.file("new", "mine"), TINY + " --out {folder}/new/run", "out: new/run"),
+    started("--refine --resolutions 8 16", "start_from must be a policy of the first resolutions of (8, 16)"),
+    started("--refine --encoder paper", "start_from must be a policy with encoder paper, got small"),
+    started("--target T", "start_from must be a policy for the target T, got the default"),
     laid("train into a loop", lambda desk: desk.link("loop"), TINY + " --out {folder}/loop", "out: loop cannot be"),
 ]
 
@@ -148,6 +157,11 @@ OTHERS = (
         ("--policy alchemy", "no shipped one has that name"),
         ("--policy alchemy --video new/a.webp", "no shipped one has that name"),
         ("--policy run --record /dev/null/a.npz", "record: "),
+        ("--policy alchemy --record a.h5", "record must end in .npz, got a.h5"),
+        ("--policy alchemy --record-fields x", "record_fields requires record"),
+        ("--policy alchemy --video a.html", "video must end in .mp4 or .gif or .webp or .png, got a.html"),
+        ("--policy alchemy --replay a.mp4", "replay must end in .html, got a.mp4"),
+        ("--policy alchemy --video a.mp4 --size 3", "size must be at least 16, got 3"),
         ("--policy run --size 100", "size requires a file"),
         ("--policy run --replay a.html --zoom 3", "zoom requires a file"),
         ("--policy run --episodes 0", "episodes must be at least 1, got 0"),
@@ -183,6 +197,13 @@ OTHERS = (
         ("none.json", "none.json: cannot be read as JSON"),
     )
     + [
+        laid(
+            "evaluations in another table",
+            lambda desk: desk.file("other.csv", "step,mean\n1,2\n"),
+            "run --rows {folder}/other.csv --device cpu",
+            "rows: other.csv must be a table with the columns protocol, task",
+            module="cfp.robustness",
+        ),
         planned([1], "plan: plan.json cannot be read as JSON"),
         planned({"colour": 1}, "must hold common, tasks and algos only, got colour"),
         planned({"common": {"seed": 5}}, "plan: common must not hold seed"),
@@ -190,12 +211,6 @@ OTHERS = (
         planned({"algos": {"cfp-sac": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp-sac.t"),
         planned({"common": {"colour": 1}}, "cfp-analytic on shapematch", "colour"),
         planned({"algos": {"zero": {"steps": 5}}}, "steps must not be under algos.zero, which is not trained"),
-        Case(
-            "evaluate an empty folder",
-            command(main_of("cfp.evaluate"), "{folder}"),
-            ("there is no run",),
-            Refused,
-        ),
     ]
 )
 

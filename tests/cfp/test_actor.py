@@ -1,13 +1,15 @@
+"""Actors and critics: what they compute, and the sizes of the reference's networks."""
+
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import distributions
-from torch.nn import functional as F
 
-from cfp.agent.actor import ActorSpec, Sample, build_actor, normalise_image, upsample
+from cfp.agent.actor import ActorSpec, Encoded, Sample, build_actor, normalise_image
 from cfp.envs.make import make_torch_env
 from cfp.presets import sac_preset
+from cfp.sac.policies import SmallCritics, TwinCritic
 from dittogym import TASKS, make_spec
 
 
@@ -41,40 +43,6 @@ def test_log_prob_is_that_of_a_squashed_gaussian():
     assert gate is None
 
 
-@pytest.mark.parametrize(("split", "scale"), [(False, 1.0), (True, 0.25)])
-@pytest.mark.parametrize("interpolation", ["half_pixel", "aligned"])
-def test_gate_blends_residual_and_coarse(split, scale, interpolation):
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec((8, 16), (-0.5,), split, scale, interpolation))
-    widen(actor)
-    image = images()
-    action, _, gate, _ = actor.sample(image, deterministic=True)
-    coarse = actor.coarse(image, deterministic=True)
-    lifted = F.interpolate(coarse, size=(16, 16), mode="bicubic", align_corners=interpolation == "aligned")
-    patch = F.interpolate(lifted, size=(64, 64), mode="bicubic", align_corners=interpolation == "aligned")
-    latent = actor.encoder(normalise_image(image), patch)
-    expected_gate = scale / (1 + torch.exp(-(actor.gate(latent) - 0.5)))
-    expected = expected_gate * torch.tanh(actor.mean(latent)) + (1 - expected_gate) * lifted
-    torch.testing.assert_close(gate, expected_gate, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
-    assert gate.shape == (3, 2, 16, 16)
-    assert gate.max() <= scale
-
-
-@pytest.mark.parametrize("resolutions", [(8, 16), (32, 64), (4, 8, 16, 32, 64)])
-def test_closed_gates_leave_the_coarsest_action(resolutions):
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec(resolutions, (-100.0,) * (len(resolutions) - 1)))
-    image = images()
-    coarsest = actor
-    while hasattr(coarsest, "coarse"):
-        coarsest = coarsest.coarse
-    expected = coarsest(image, deterministic=True)
-    for resolution in resolutions[1:]:
-        expected = upsample(expected, resolution, "half_pixel")
-    torch.testing.assert_close(actor(image, deterministic=True), expected, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_closed_gates_leave_the_coarsest_field(task):
     config = sac_preset(task, "quick")
@@ -102,43 +70,64 @@ def test_closed_gates_leave_the_coarsest_field(task):
             torch.testing.assert_close(field, fields[0], rtol=0, atol=1e-5 * float(fields[0].abs().max()))
 
 
-def test_composed_action_is_not_clipped():
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec((8, 16), (-100.0,)))
-    with torch.no_grad():
-        actor.coarse.mean[-1].weight.mul_(1000)
-    assert actor(images(), deterministic=True).abs().max() > 1.001
-
-
-def test_coarser_stages_are_frozen_and_drawn_anew():
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec((8, 16), (0.0,)))
-    image = images()
-    action, log_prob, gate, _ = actor.sample(image)
-    (action.square().sum() + log_prob.sum()).backward()
-    assert all(parameter.grad is None for parameter in actor.coarse.parameters())
-    assert all(parameter.grad is not None for parameter in actor.trainable_parameters())
-    assert gate.requires_grad
-    state = torch.get_rng_state()
-    first = actor.coarse(image)
-    torch.set_rng_state(state)
-    torch.testing.assert_close(actor.coarse(image), first)
-    assert not torch.equal(actor.coarse(image), first)
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"resolutions": (7,)}, "resolutions must be increasing"),
         ({"resolutions": (16, 8)}, "resolutions must be increasing"),
         ({"resolutions": ()}, "resolutions must be increasing"),
         ({"gate_bias": ()}, "gate_bias must have 1 values"),
         ({"encoder": "large"}, "encoder must be paper or small, got 'large'"),
         ({"interpolation": "bilinear"}, "interpolation must be half_pixel or aligned, got 'bilinear'"),
-        ({"gate_scale": -0.25}, "gate_scale must be positive, got -0.25"),
         ({"gate_scale": float("nan")}, "gate_scale must be positive, got nan"),
     ],
 )
 def test_impossible_structures_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         ActorSpec(**{"resolutions": (8, 16), "gate_bias": (0.0,)} | fields)
+
+
+# Networks.
+
+
+def trainable(module):
+    return sum(parameter.numel() for parameter in module.parameters() if parameter.requires_grad)
+
+
+@pytest.mark.parametrize(
+    ("resolutions", "split", "count"),
+    [
+        ((4,), False, 234176),
+        ((8,), False, 80596),
+        ((16,), False, 82388),
+        ((32,), False, 82612),
+        ((64,), False, 83388),
+        ((8, 16), False, 96894),
+        ((8, 16), True, 66174),
+        ((32, 64), False, 98394),
+        ((8,), True, 80596),  # the first stage never sees an action: split or not is the same
+    ],
+)
+def test_actor_has_the_reference_size(resolutions, split, count):
+    actor = build_actor(ActorSpec(resolutions, (-1.0,) * (len(resolutions) - 1), split=split))
+    assert trainable(actor) == sum(parameter.numel() for parameter in actor.trainable_parameters()) == count
+
+
+@pytest.mark.parametrize(("split", "count"), [(False, 526082), (True, 464642)])
+def test_critics_have_the_reference_size_and_share_nothing(split, count):
+    assert trainable(TwinCritic(8, split, "aligned")) == count
+
+
+def test_small_critics_equal_each_on_its_own():
+    critics, action = SmallCritics(8), torch.randn(2, 2, 8, 8)
+    seen = Encoded(torch.randn(2, 3, 32, 32), torch.randn(2, 16, 4, 4))
+    parts = critics.actions(action).chunk(2, dim=1)
+    expected = [head(torch.cat([seen.features, part], 1)) for head, part in zip(critics.heads, parts, strict=True)]
+    torch.testing.assert_close(list(critics(seen, action)), expected)
+
+
+def test_linear_layers_are_xavier():
+    torch.manual_seed(0)
+    for layer in build_actor(ActorSpec((4,))).modules():
+        if isinstance(layer, torch.nn.Linear):
+            bound = (6 / (layer.in_features + layer.out_features)) ** 0.5
+            assert 0.95 * bound < layer.weight.abs().max() <= bound and not layer.bias.any()

@@ -54,8 +54,9 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path)
     spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=without_derivative, weights={"far": 1.0})
     monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
     learner = CFPAnalytic.create(replace(make(reward="task"), task="nan"), 1, tmp_path)
-    with pytest.warns(UserWarning, match="most gradients of a window are not finite"):
-        update(learner, 9)
+    with pytest.warns(UserWarning, match="most gradients of a window are not finite and were left out"):
+        rows = update(learner, 9)
+    assert rows[-1]["train/dropped"] == 9 * 4 * 2
     with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row"):
         update(learner)
 
@@ -126,6 +127,10 @@ def test_outlying_gradient_does_not_drown_the_others():
     assert step.limited == 1 and change.isfinite().all()
     assert 2.5 < norms[1, 2] / norms.median() < 3.5
     assert norms.min() > 0.2 * norms.median()
+    resumed, later = ActionStep(), 100 * gradients
+    resumed.load_state_dict(step.state_dict())
+    assert torch.equal(resumed(locations, later, 0.1), step(locations, later, 0.1))
+    assert not torch.equal(ActionStep()(locations, later, 0.1), step(locations, later, 0.1))
 
 
 def test_memory_keeps_the_latest_pairs_and_survives_a_checkpoint():
@@ -157,8 +162,6 @@ def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation():
     torch.testing.assert_close(parameters(regression.average.module), average, rtol=0, atol=1e-5)
     assert not torch.equal(average, parameters(actor))
     assert all(torch.equal(value, dict(actor.named_parameters())[name]) for name, value in frozen.items())
-    std = actor.act(actor.outputs(images)).log_prob
-    assert std.isfinite().all()
 
 
 def test_rates_fall_along_a_line(tmp_path):
@@ -186,27 +189,6 @@ def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):
         assert policy.predict(observation, deterministic=True)[0].shape == second.action_space.shape
 
 
-def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
-    """The step on the actions, were it small, increases the return of the same window."""
-    config = make(substeps=100, gamma=1.0, num_envs=1)
-    learner = CFPAnalytic.create(config, 1, tmp_path)
-    env, collector = learner.simulation, learner.collector
-    start = env.save()
-    leaf = torch.randn(4, 1, *env.action_shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
-
-    def window_return(actions):
-        env.load(start)
-        steps = iter(actions)
-        return collector.collect(lambda _: next(steps).tanh(), learner.critic, go_on).rewards.sum()
-
-    before = window_return(leaf)
-    (gradient,) = torch.autograd.grad(-before, leaf)
-    improved = learner.action_step(leaf.detach(), gradient, 0.1)
-    after = window_return(improved)
-    expected = -(gradient * (improved - leaf)).sum()
-    assert (after - before).item() == pytest.approx(expected.item(), rel=0.2) and after > before
-
-
 def test_a_trained_policy_is_kept_until_the_critic_has_learned(tmp_path):
     learner = CFPAnalytic.create(make(warmup=2), 1, tmp_path)
     learner.starts_trained = True
@@ -232,19 +214,3 @@ def test_steps_with_success_pay_the_option_and_an_end_with_success_has_its_value
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0, go_on)
     assert window.rewards.tolist() == [[pytest.approx(paid, abs=1e-6)] * 2]
     assert window.next_values.tolist() == [[pytest.approx(value)] * 2]
-
-
-def test_gradients_that_are_not_finite_are_left_out_with_a_warning():
-    def rooted(transition, spec):
-        risen = transition.now.com[:, 1] - transition.start.com[:, 1]
-        return Reward(terms={"risen": (risen * (risen > 0)).sqrt()})
-
-    spec = replace(dittogym.make_spec("run"), reward_fn=rooted, weights={"risen": 1.0})
-    env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
-    collector = WindowCollector(env, lambda: torch.zeros(2, 1), WindowConfig(task="run", algo="shac", window=2))
-    action = torch.zeros(2, *env.action_shape, requires_grad=True)
-    window = collector.collect(lambda _: action, lambda seen: seen[:, 0], go_on)
-    window.rewards.sum().backward()
-    with pytest.warns(UserWarning, match="most gradients of a window are not finite and were left out"):
-        assert collector.scalars(window)["train/dropped"] == 4
-    assert not action.grad.any()

@@ -8,10 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from fakes import FakeEnv
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from cfp import CFPPolicy, Hyperparameters
@@ -37,7 +35,7 @@ def fill(ring, start, stop):
     for row in range(start, stop):
         image = np.full((2, 3, 64, 64), row, np.uint8)
         action = np.full((2, 2, 8, 8), row / 100, np.float32)
-        infos = [{"TimeLimit.truncated": row % 3 == 0}, {}]
+        infos = [{"TimeLimit.truncated": row % 4 == 0}, {}]
         ring.add(image, image + 1, action, np.array([row, -row], np.float32), np.array([row % 2 == 0] * 2), infos)
 
 
@@ -55,8 +53,8 @@ def test_batch_has_no_repetition_and_keeps_rows_together():
     assert (batch.observations[:, 0, 0, 0] == row).all()
     assert (batch.next_observations[:, 0, 0, 0] == row + 1).all()
     np.testing.assert_allclose(batch.actions[:, 0], row / 100, rtol=1e-6)
-    first = batch.rewards[:, 0] > 0  # element 0 of the batch has the time limits, at rows 0, 3, ...
-    limit = first & (row % 3 == 0)
+    first = batch.rewards[:, 0] > 0  # element 0 of the batch has the time limits, at rows 0, 4, ...
+    limit = first & (row % 4 == 0)
     expected = ((row % 2 == 0) & ~limit & (row > 0)).float()
     assert (batch.dones[row > 0, 0] == expected[row > 0]).all()
     assert len(ring.sample(20).rewards) == 20
@@ -79,17 +77,6 @@ def test_ring_comes_back_from_its_chunks_which_never_change(tmp_path, saves):
         assert sorted(path.name for path in tmp_path.iterdir()) == sorted(chunk["file"] for chunk in chunks)
         assert all(chunk["stop"] > rows - 6 for chunk in chunks)
         written = {path: path.read_bytes() for path in tmp_path.iterdir()}
-
-
-def test_chunks_of_the_last_checkpoint_outlive_the_next_save(tmp_path):
-    ring, kept, other, archive = make_ring(), make_ring(), make_ring(), ReplayArchive(tmp_path, 1)
-    fill(ring, 0, 4)
-    fill(kept, 0, 4)
-    chunks = archive.save(ring, 4)
-    fill(ring, 4, 16)
-    archive.save(ring, 16)  # killed here: the state file still names the old chunks
-    ReplayArchive(tmp_path, 1).load(other, 4, chunks)
-    assert_same_ring(kept, other)
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "flipped"])
@@ -145,65 +132,12 @@ def make_sac(stage=2):
     return model
 
 
-class Hook(BaseCallback):
-    """Calls a function between two rollouts."""
-
-    def __init__(self, function):
-        super().__init__()
-        self.function = function
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_start(self):
-        self.function(self.model)
-
-
-def assert_same(first, second, path="state"):
-    assert type(first) is type(second), path
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), path
-        for key in first:
-            assert_same(first[key], second[key], f"{path}.{key}")
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), path
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{path}.{index}")
-    elif isinstance(first, torch.Tensor):
-        assert torch.equal(first, second), path
-    elif not path.endswith(".t"):  # wall time of an episode
-        assert first == second, path
-
-
-@pytest.mark.parametrize("stop", [8, 50])  # in the random phase, and after the ring has wrapped around
-def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, stop):
-    """What the files of a run do not show, too: optimisers, generators, episodes in progress, the replay memory."""
-    checkpoint = Checkpoint(tmp_path)
-
-    def save(model):
-        if model.num_timesteps == stop:
-            checkpoint.save(model, SAC, 100)
-
-    model = make_sac()
-    model.learn(70, Hook(save))
-    resumed = make_sac()
-    torch.rand(5)  # generators are somewhere else
-    state = Checkpoint(tmp_path).read()
-    assert (state["stage"], state["offset"]) == (model.stage, 100)
-    Checkpoint(tmp_path).restore(resumed, state)
-    assert resumed.num_timesteps == stop
-    resumed.learn(70 - stop, reset_num_timesteps=False)
-    assert_same(resumed.state_dict(), model.state_dict())
-    batch, again = model.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
-    assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
-
-
 @pytest.mark.parametrize("file", ["state.pt", "stage"])
 def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, file):
     checkpoint, model = Checkpoint(tmp_path), make_sac()
     model.learn(20)
     checkpoint.save(model, SAC, 0)
-    model.learn(30, reset_num_timesteps=False)
+    model.learn(60, reset_num_timesteps=False)  # the ring holds none of the first rows any more
 
     def crash(path, write):
         if not path.name.startswith(file):

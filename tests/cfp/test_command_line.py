@@ -91,6 +91,15 @@ def test_stages_that_learn_nothing_are_named(words, lines, tmp_path):
         assert [line.split(" (")[0] for line in told] == [line for line in lines if first == 1 or "stage 2" in line]
 
 
+def run_raising(error):
+    """Exit code of a program that raises an error."""
+
+    def command():
+        raise error
+
+    return run_command(command)
+
+
 @pytest.mark.parametrize(
     ("error", "code"),
     [
@@ -104,28 +113,19 @@ def test_stages_that_learn_nothing_are_named(words, lines, tmp_path):
     ],
 )
 def test_expected_error_is_one_line_and_an_exit_code(capsys, error, code):
-    def command():
-        raise error
-
-    assert run_command(command) == code
+    assert run_raising(error) == code
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
     assert str(error) in captured.err
 
 
 def test_exit_codes_of_programs_that_end_stop_or_fail(capsys):
-    def raises(error):
-        def command():
-            raise error
-
-        return command
-
     assert run_command(lambda: None) == 0 and run_command(lambda: 1) == 1
-    assert run_command(raises(Stopped(signal.SIGTERM, "resume with: the same command"))) == 128 + signal.SIGTERM
+    assert run_raising(Stopped(signal.SIGTERM, "resume with: the same command")) == 128 + signal.SIGTERM
     assert capsys.readouterr().out == "stopped by SIGTERM; resume with: the same command\n"
-    assert run_command(raises(KeyboardInterrupt())) == 130
+    assert run_raising(KeyboardInterrupt()) == 130
     with pytest.raises(RuntimeError, match="a mistake"):  # keeps its traceback
-        run_command(raises(RuntimeError("a mistake in the program")))
+        run_raising(RuntimeError("a mistake in the program"))
 
 
 def test_output_that_nobody_reads_any_more_is_no_error(monkeypatch):

@@ -56,6 +56,7 @@ def test_paper_presets_hold_the_published_numbers():
         assert (one.actor_start, two.actor_start) == (0, 0)
         assert config.ends() == (handover, steps)
         spec = config.actor_spec(2)
+        assert sac_preset(task).actor_spec(2).fill_missing and not spec.fill_missing
         assert spec.resolutions == ((32, 64) if task == "shapematch" else (8, 16))
         assert (spec.gate_bias, spec.split, spec.encoder) == ((bias,), task == "dig", "paper")
         assert (spec.gate_scale, spec.interpolation) == (0.25 if task == "dig" else 1.0, "aligned")
@@ -70,9 +71,6 @@ def test_paper_presets_hold_the_published_numbers():
 def test_quick_learns_by_gradients_and_paper_from_rewards():
     algos = [cfp.preset("run", *words).algo for words in ((), ("long",), ("paper",), ("quick", "cfp-sac"))]
     assert algos == ["cfp-analytic", "cfp-sac", "cfp-sac", "cfp-sac"]
-    for words, named in ((("paper", "cfp-analytic"), "preset"), (("quick", "ppo"), "algo"), (("slow",), "preset")):
-        with pytest.raises(ConfigError, match=named):
-            cfp.preset("run", *words)
     assert cfp.preset("run").name == "cfp-analytic-run-quick-0"
 
 
@@ -91,70 +89,10 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
         sac_preset("hop", "paper")
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"steps": 1.5}, "steps must be of type int, got 1.5"),
-        ({"steps": True}, "steps must be of type int"),
-        ({"video": 1}, "video must be of type bool"),
-        ({"tau": "0.5"}, "tau must be of type float"),
-        ({"dtype": "float16"}, r"dtype must be of type Literal\['float32', 'float64'\]"),
-        ({"particles": [1.5, 2]}, "particles must be of type"),
-        ({"alpha": [0.1, "x"]}, r"alpha must be of type tuple\[float, ...\]"),
-        ({"resolutions": 8}, "resolutions must be of type"),
-        ({"noise_scale": [1.0, 2.0, 3.0]}, "noise_scale must be of type"),
-        ({"target": 3}, "target must be of type str | None"),
-        ({"gate_bias": [10**400]}, r"gate_bias must be below 2\*\*63"),
-    ],
-)
-def test_value_of_another_type_is_named(values, message):
-    with pytest.raises(ConfigError, match=message):
-        sac(**values)
-
-
 def test_json_values_take_the_types_of_their_fields():
     config = update_from_dict(sac_preset("shapematch"), {"alpha": [1, 0], "particles": [500, 20], "dt": 1})
     assert (config.alpha, config.particles, config.target) == ((1, 0), (500, 20), None)
     assert isinstance(config.dt, float)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"steps": 0}, "steps must be at least 1, got 0"),
-        ({"num_envs": 10_001}, "num_envs must be at most 10000"),
-        ({"alpha": []}, "alpha must have at least one value"),
-        ({"resolutions": []}, "resolutions must have at least one value"),
-        ({"resolutions": [4, 8, 16]}, "handover must have 2 values"),
-        ({"handover": [1.0]}, "handover must be shares of the steps between 0 and 1"),
-        ({"resolutions": [4, 8, 16], "handover": [0.5, 0.4]}, "steps and handover must give every stage"),
-        ({"steps": 20}, "steps and handover must give every stage at least 16 steps"),
-        ({"critics_first": [1.0]}, "critics_first must be at least 0 and less than 1, got 1"),
-        ({"noise_cells": 3}, "noise_cells must be one of"),
-        ({"noise_cells": 8}, "noise_cells must be at most 4"),
-        ({"noise_scale": [0.0, 1.0]}, "noise_scale must be positive"),
-        ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
-        ({"gamma": 1.0}, "gamma must be below 1 with several n_steps"),
-        ({"buffer_size": 20}, "buffer_size must be at least batch_size"),
-        ({"refine": True}, "refine requires start_from"),
-        ({"algo": "cfp-analytic", "window": 0}, "window must be at least 1, got 0"),
-        ({"algo": "cfp-analytic", "action_step": [0.0]}, "action_step must be positive, got 0"),
-        ({"algo": "cfp-analytic", "weight_average": 1.0}, "weight_average must be at least 0 and less than 1"),
-        ({"algo": "cfp-analytic", "num_layouts": 9_999}, "num_layouts must be at most 9992"),
-        ({"algo": "cfp-analytic", "vary_start": 0.0}, "vary_start requires vary"),
-        ({"vary": 1.5}, "vary must be between 0 and 1, got 1.5"),
-        ({"vary_latency": -1}, "vary_latency must be at least 0, got -1"),
-        ({"vary_noise": -0.1}, "vary_noise must be at least 0, got -0.1"),
-        ({"vary_actions": 1.1}, "vary_actions must be between 0 and 1, got 1.1"),
-        ({"vary_pixels": -0.1}, "vary_pixels must be between 0 and 1, got -0.1"),
-        ({"vary_physics": 1.0}, "vary_physics must be at least 0 and less than 1, got 1.0"),
-        ({"vary_start": -1.0}, "vary_start must be at least 0, got -1.0"),
-        ({"algo": "cfp-analytic", "train_dt": 3e-4}, "train_dt must divide an environment step of 0.01 s"),
-    ],
-)
-def test_value_out_of_range_is_named(values, message):
-    with pytest.raises(ConfigError, match=message):
-        sac(**values).check()
 
 
 def test_shares_follow_the_steps_and_the_last_value_holds_for_all_further_stages():
@@ -186,20 +124,7 @@ def test_matter_of_the_published_run_of_slot_can_be_chosen():
         matter(task="run", variant="published")
 
 
-def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
-    trained = []
-
-    class Recording(dittogym.TorchEnv):
-        def reset(self, *, seed=None, options=None):
-            trained.extend(seed if isinstance(seed, list) else [])
-            return super().reset(seed=seed, options=options)
-
-    env = Recording("run", 3, particles=20, substeps=1)
-    done = torch.ones(3, dtype=torch.bool)
-    episodes = Episodes(env, 5, max_episode_steps=2, num_layouts=4)
-    for _ in range(3):
-        episodes.restart(episodes.read(done, done, done))
-    assert len(set(trained)) == 4 and min(trained) >= 5 and max(trained) < 5 + 8
+def test_evaluations_and_the_final_table_have_layouts_of_their_own():
     config = sac(seed=5, eval_episodes=7)
     assert config.evaluation(1) == config.evaluation(2) == (10_005, 7)
     assert evaluation_seed(config) == 20_005

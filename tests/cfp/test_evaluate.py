@@ -101,18 +101,15 @@ def test_trials_on_a_gpu_are_played_one_at_a_time(monkeypatch):
 
 
 def test_noise_differs_between_layouts_and_steps():
-    class Recorder(LinearPolicy):
-        def __init__(self):
-            super().__init__()
-            self.drawn = []
+    drawn = []
 
+    class Recorder(Counting):
         def predict(self, *arguments, **options):
-            self.drawn.append(torch.randn(3))
+            drawn.append(torch.randn(3))
             return super().predict(*arguments, **options)
 
-    policy = Recorder()
-    evaluate([fake_trial(policy, 3)])
-    assert len(policy.drawn) == 12 and len(torch.stack(policy.drawn).unique(dim=0)) == 12
+    evaluate([fake_trial(Recorder(), 3)])
+    assert len(drawn) == 12 and len(torch.stack(drawn).unique(dim=0)) == 12
 
 
 @pytest.mark.parametrize("together", [False, True])

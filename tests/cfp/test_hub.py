@@ -109,12 +109,6 @@ def test_run_pushes_its_results(server, finished):
     assert same(cfp.load(address), cfp.load(finished))
 
 
-@pytest.mark.parametrize("address", ["hf://runner", "hf://a/b/c", "hf://a/b@", "hf://a/b@../../x y"])
-def test_other_forms_of_addresses_are_refused(address):
-    with pytest.raises(cfp.CheckpointError, match="path must have the form"):
-        cfp.load(address)
-
-
 def test_what_the_hub_refuses_is_one_error(server, policy):
     with pytest.raises(cfp.CheckpointError, match="hf://someone/else: cannot be downloaded"):
         cfp.load("hf://someone/else")

@@ -156,8 +156,3 @@ def test_a_policy_that_did_not_fill_can_be_refined_by_one_that_does(tmp_path):
         folder = tmp_path / str(own.fill_missing)
         folder.mkdir()
         assert CoarseToFine.begin(own, folder)[0] == 2
-
-
-def test_presets_fill_but_for_that_of_the_paper():
-    assert cfp.preset("run").fill_missing and cfp.preset("run", "quick", "cfp-sac").fill_missing
-    assert cfp.preset("run", "long").fill_missing and not cfp.preset("run", "paper").actor_spec(2).fill_missing

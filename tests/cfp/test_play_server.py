@@ -56,10 +56,10 @@ def server() -> Iterator[Server]:
         yield server
 
 
-def open_page(server: Server, token: str = "secret", origin: str | None = "own") -> ClientConnection:
+def open_page(server: Server) -> ClientConnection:
     """A WebSocket as the page opens it."""
-    origin = f"http://127.0.0.1:{server.port}" if origin == "own" else origin
-    return connect(f"ws://127.0.0.1:{server.port}/ws?token={token}", origin=origin, proxy=None)  # type: ignore[arg-type]
+    host = f"127.0.0.1:{server.port}"
+    return connect(f"ws://{host}/ws?token=secret", origin=f"http://{host}", proxy=None)  # type: ignore[arg-type]
 
 
 def receive(page: ClientConnection, wanted: str) -> Any:
@@ -89,55 +89,45 @@ def status(server: Server, path: str, host: str | None = None) -> tuple[int, str
             return error.code, error.read().decode(), error.headers
 
 
-def test_page_and_token(server: Server) -> None:
-    assert status(server, "/")[0] == status(server, "/?token=guess")[0] == 403
+def test_page_and_its_files(server: Server) -> None:
     code, page, headers = status(server, "/?token=secret")
     assert code == 200 and "default-src 'self'" in headers["content-security-policy"]
     assert "http" not in page  # nothing comes from elsewhere
     code, _, headers = status(server, "/page/main.js")
     assert code == 200 and headers["cache-control"] == "no-store"
     assert status(server, "/page/../server.py")[0] == 404
-    assert status(server, "/?token=secret", host="example.org")[0] == 400
-
-
-@pytest.mark.parametrize(
-    ("token", "origin"),
-    [("", "own"), ("guess", "own"), ("secret", None), ("secret", "null"), ("secret", "http://127.0.0.1:1")],
-)
-def test_strangers_are_refused(server: Server, token: str, origin: str | None) -> None:
-    with pytest.raises(InvalidStatus, match="403"):
-        open_page(server, token, origin)
 
 
 @pytest.mark.parametrize(
     ("root_path", "host", "origin", "stranger"),
     [
+        ("", "localhost:8000", "http://localhost:8000", "http://localhost:1"),
         ("https://Hub.example.org/user/me", "hub.example.org", "https://hub.example.org", "http://hub.example.org"),
         ("https://hub.example.org/user/me/", "127.0.0.1:8000", "https://hub.example.org", "http://127.0.0.1:8000"),
         ("/user/me", "127.0.0.1:9000", "http://127.0.0.1:9000", "https://hub.example.org"),
     ],
-    ids=["whole address", "host not passed on", "path alone"],
+    ids=["no proxy", "whole address", "host not passed on", "path alone"],
 )
-@pytest.mark.parametrize("prefix", ["", "/user/me"])
-def test_behind_a_proxy(prefix: str, root_path: str, host: str, origin: str, stranger: str) -> None:
-    """With the path that the proxy may take away, for its page and no other."""
-    with serve(root_path) as server:
+def test_its_own_page_is_let_in_with_the_token(root_path: str, host: str, origin: str, stranger: str) -> None:
+    """Also behind a proxy, which may take the path away."""
+    with serve(root_path) as server, contextlib.ExitStack() as stack:
 
-        def open_page(token: str, origin: str | None) -> ClientConnection:
+        def open_page(prefix: str, token: str, origin: str | None) -> ClientConnection:
             stream = stack.enter_context(socket.create_connection(("127.0.0.1", server.port)))
             return connect(f"ws://{host}{prefix}/ws?token={token}", sock=stream, origin=origin, proxy=None)  # type: ignore[arg-type]
 
-        for path, code in (("/?token=secret", 200), ("/page/main.js", 200), ("/?token=guess", 403)):
-            assert status(server, prefix + path, host)[0] == code
-        assert status(server, f"{prefix}/?token=secret", "example.com")[0] == 400
-        with contextlib.ExitStack() as stack:
-            for token, source in (("guess", origin), ("secret", stranger), ("secret", None)):
+        for prefix in sorted({"", server.prefix}):
+            for path, code in (("/?token=secret", 200), ("/page/main.js", 200), ("/?token=guess", 403), ("/", 403)):
+                assert status(server, prefix + path, host)[0] == code
+            assert status(server, f"{prefix}/?token=secret", "example.com")[0] == 400
+            refused = [("secret", source) for source in (stranger, "null", None)]
+            for token, source in (("", origin), ("guess", origin), *refused):
                 with pytest.raises(InvalidStatus, match="403"):
-                    open_page(token, source)
-            with open_page("secret", origin) as page:
+                    open_page(prefix, token, source)
+            with open_page(prefix, "secret", origin) as page:
                 assert receive(page, "hello")["task"] == "run"
         start = "https://hub.example.org" if server.proxy else f"http://127.0.0.1:{server.port}"
-        assert server.address == f"{start}/user/me/?token=secret"
+        assert server.address == f"{start}{server.prefix}/?token=secret"
 
 
 def test_malformed_messages_are_answered_and_survived(server: Server) -> None:

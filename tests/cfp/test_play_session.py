@@ -86,24 +86,6 @@ def test_every_task_can_be_played(task: str) -> None:
     assert len(shown(played).rows) == 0
 
 
-def test_pulling_moves_matter_towards_the_pointer() -> None:
-    played, alone = (session(substeps=100) for _ in range(2))
-    com = played.env.env_state.centre[0].tolist()
-    for step in range(1, 31):
-        played.apply(Hand("pull", com[0], com[1] + 0.01 * min(step, 8), id=step))
-        played.advance()
-        alone.advance()
-    up = float(played.env.env_state.centre[0, 1] - alone.env.env_state.centre[0, 1])
-    assert 0.02 < up < 0.12
-    assert shown(played).echo == 30
-    played.apply(Hand("pull", 9.0, 9.0))  # still holds it
-    assert played.grip is not None
-    for tool, x in ((None, 0.0), ("pull", 9.0)):  # lets go, and finds nothing
-        played.apply(Hand(tool, x, 9.0))
-        played.advance()
-        assert played.grip is None
-
-
 def test_a_pull_takes_hold_at_the_press_and_keeps_it() -> None:
     """Although the pointer is far away before time goes on, and the robot hangs on its uppermost matter."""
     played = session(particles="lite", substeps=100)
@@ -118,6 +100,11 @@ def test_a_pull_takes_hold_at_the_press_and_keeps_it() -> None:
     uppermost = x[(start - top).norm(dim=1) < 0.03].mean(0)
     assert abs(float(uppermost[1] - top[1]) - 0.2) < 0.05 and abs(float(uppermost[0] - top[0])) < 0.03
     assert float((x - start).mean(0)[1]) > 0.15 and np.ptp(x.numpy(), axis=0).max() < 0.22  # all of it, in one piece
+    for tool, holds in (("pull", True), (None, False), ("pull", False)):  # still holds it, lets go, and finds nothing
+        played.apply(Hand(tool, 9.0, 9.0, id=7))
+        played.advance()
+        assert (played.grip is not None) == holds
+    assert shown(played).echo == 7
 
 
 def test_muscles_under_the_pointer() -> None:
@@ -188,10 +175,7 @@ def test_policies_with_other_orientations_and_gates() -> None:
     fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
     played = session(policies={"fine": lambda: fine}, policy="fine")
     played.advance()
-    images = played.observation.numpy()
     assert shown(played).gate.shape == (2, 16, 16) and shown(played).gate.any()
-    action, gate = fine.predict_with_gate(images, True)
-    assert np.array_equal(action, fine.predict(images, deterministic=True)[0]) and gate.shape == (1, 2, 16, 16)
 
 
 def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
@@ -219,6 +203,7 @@ def test_moments() -> None:
     played = session()
     with pytest.raises(ValueError, match="moment"):
         played.apply(protocol.Back())
+    assert not played.describe()["saved"]
     played.advance()
     snapshot = torch.load(saved_file(played, "moment"), weights_only=True)
     then = played.env.state.x.clone()
@@ -226,6 +211,10 @@ def test_moments() -> None:
     played.apply(protocol.Back())
     frame = shown(played)
     assert torch.equal(played.env.state.x, then) and (frame.step, len(frame.rows)) == (1, 0)
+    assert played.describe()["saved"] and not played.history.touched
+    played.apply(Matter(stiffness=2, yield_stress=1, gravity=9))
+    assert played.apply(protocol.Back()) == [{"type": "reset"}]
+    assert played.history.touched == ["other matter or gravity"]
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)
@@ -247,16 +236,6 @@ def test_going_back_restores_the_outcome_and_the_memory_of_the_same_policy() -> 
     played.apply(protocol.Policy("constant"))
     played.apply(protocol.Back())
     assert played.history.memory is None  # of another policy
-
-
-def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
-    played = session()
-    played.advance()
-    played.apply(Save("moment"))
-    played.apply(protocol.Matter(stiffness=2, yield_stress=1, gravity=9))
-    assert played.apply(protocol.Back()) == [{"type": "reset"}]
-    assert played.history.touched == ["other matter or gravity"]
-    assert played.describe()["saved"] and not session().describe()["saved"]
 
 
 def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
@@ -325,8 +304,6 @@ def test_drawings() -> None:
     before = played.env
     with pytest.raises(ValueError, match="body must"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
-    with pytest.raises(ValueError, match="robot must"):
-        session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
     answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
     assert answers[-1]["type"] == "notice" and "no robot can be expected" in answers[-1]["message"]
@@ -384,15 +361,6 @@ def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
     played.apply(Reset(seed=5))
     played.apply(Step())
     assert shown(played).step == 1 and not played.playing
-
-
-def test_a_policy_that_fails_stops_time() -> None:
-    broken = Constant(resolution=4)
-    played = session(policies={"broken": lambda: broken}, policy="broken")
-    broken.predict = None
-    with pytest.raises(TypeError):
-        played.advance()
-    assert not played.playing
 
 
 def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:

@@ -13,11 +13,10 @@ from scipy import stats
 
 from cfp import robustness
 from cfp.agent.actor import build_actor
-from cfp.errors import ConfigError
 from cfp.evaluate import open_policy
 from cfp.evaluation.returns import Played, Result
 from cfp.presets import preset, sac_preset
-from cfp.robustness import DISTURBANCES, choose, effective, ratios
+from cfp.robustness import DISTURBANCES, effective, ratios
 from dittogym import TASKS, Conditions, TorchEnv, make_spec
 
 
@@ -26,14 +25,6 @@ def test_disturbances_that_change_nothing_in_a_task_or_for_a_policy_are_left_out
     assert effective(make_spec("run"), True) == every
     assert effective(make_spec("shapematch"), True) == [name for name in every if "gravity" not in name]
     assert "observation dropout" not in effective(make_spec("run"), False)
-
-
-def test_disturbances_are_chosen_by_words():
-    names = effective(make_spec("shapematch"), True)
-    assert choose(names, []) == names
-    assert choose(names, ["dropout", "mu x 0.8"]) == ["action dropout", "observation dropout", "mu x 0.8"]
-    with pytest.raises(ConfigError, match=r"cases must be words of action dropout.*got 'gravity'"):
-        choose(names, ["dropout", "gravity"])
 
 
 def test_interval_is_student_s():
@@ -65,12 +56,18 @@ def made(monkeypatch):
     return envs
 
 
+CONFIG = sac_preset("shapematch")
+
+
+def save(folder, steps=0, config=CONFIG):
+    folder.mkdir(parents=True, exist_ok=True)
+    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, steps)
+
+
 @pytest.fixture
 def folder(tmp_path):
-    config = sac_preset("shapematch")
     torch.manual_seed(0)
-    (tmp_path / "mine").mkdir()
-    save_actor(tmp_path / "mine" / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    save(tmp_path / "mine")
     return tmp_path / "mine"
 
 
@@ -112,9 +109,7 @@ def test_every_case_has_its_starts_disturbance_and_particles(folder, made, tmp_p
 def test_different_policies_of_one_name_are_refused(folder, tmp_path, capsys):
     """Each would replace the rows of the other in a table."""
     other = tmp_path / "more" / "mine"
-    other.mkdir(parents=True)
-    config = sac_preset("shapematch")
-    save_actor(other / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    save(other)
     words = ["--episodes", "1", "--full", "0", "--disturbed", "0", "--device", "cpu"]
     assert robustness.main([str(folder), str(other), *words]) == 2
     assert "policies must have names of their own, got two called 'mine' on shapematch" in capsys.readouterr().err
@@ -134,11 +129,10 @@ def test_rows_are_kept_until_the_policy_or_the_number_of_episodes_is_another(fol
     assert table.read_text() == first and played() == 0
     assert command(folder, table, short.replace("--episodes 2", "--episodes 3")) == 0
     assert played() == 3 and len(rows_of(table)) == 4
-    config = sac_preset("shapematch")
-    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 1)
+    save(folder, steps=1)
     assert command(folder, table, short.replace("--episodes 2", "--episodes 3")) == 0
     assert played() == 3 + 1  # the policy's two rows, and not those of zero and random actions
-    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 2)
+    save(folder, steps=2)
     assert command(folder, table, short.replace("latency", "noise")) == 0
     own = [row["case"] for row in rows_of(table) if row["policy"] == "mine"]
     assert own == ["undisturbed", "action noise"]  # nothing is left of the earlier file
@@ -169,8 +163,7 @@ def test_action_noise_of_the_policy_is_an_option_and_has_rows_of_its_own(folder,
 
 
 def test_policy_for_another_control_step_is_refused(folder, tmp_path, capsys):
-    config = replace(sac_preset("shapematch"), substeps=50)
-    save_actor(folder / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    save(folder, config=replace(CONFIG, substeps=50))
     assert command(folder, tmp_path / "rows.csv") == 2
     assert "policies must be a policy for environment steps of 0.01 s, got 0.005" in capsys.readouterr().err
 
@@ -189,12 +182,6 @@ def test_policies_of_two_tasks_of_one_name_are_refused(tmp_path, monkeypatch, ca
             save_actor(file, build_actor(config.actor_spec(1)), replace(config, task=f"{file.stem}:slope"), 1, 0)
         assert robustness.main([*map(str, files), "--device", "cpu"]) == 2
     assert "module 'second_slope' has registered another 'slope' since" in capsys.readouterr().err
-
-
-def test_table_must_be_one_of_evaluations(folder, tmp_path, capsys):
-    (tmp_path / "other.csv").write_text("step,mean\n1,2\n")
-    assert command(folder, tmp_path / "other.csv") == 2
-    assert "must be a table with the columns protocol, task" in capsys.readouterr().err
 
 
 def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path):

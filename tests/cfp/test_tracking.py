@@ -1,7 +1,7 @@
 """What a run shows while it trains: names, pictures, Weights & Biases."""
 
 import sys
-import types
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -26,33 +26,11 @@ def events(folder):
     return read
 
 
-class FakeWandb(types.ModuleType):
-    """Notes what it is given."""
-
-    def __init__(self):
-        super().__init__("wandb")
-        self.started, self.points, self.finished, self.steps = [], [], 0, []
-
-    def init(self, **options):
-        self.started.append(options)
-        return self
-
-    def define_metric(self, name, step_metric=None):
-        self.steps.append((name, step_metric))
-
-    def log(self, values):
-        self.points.append(values)
-
-    def finish(self):
-        self.finished += 1
-
-    def Image(self, pixels):
-        return ("image", pixels.shape)
-
-
 @pytest.fixture
 def wandb(monkeypatch):
-    fake = FakeWandb()
+    """Notes what it is given."""
+    fake = mock.Mock(Image=lambda pixels: ("image", pixels.shape))
+    fake.init.return_value = fake
     monkeypatch.setitem(sys.modules, "wandb", fake)
     return fake
 
@@ -113,18 +91,21 @@ def test_weights_and_biases_gets_all_rows_and_leaves_learning_as_it_was(finished
     folder = tmp_path / "run"
     assert run(folder, *"--wandb offline --wandb-project mine".split()) == 0
     assert_same_run(folder, finished)
-    (options,) = wandb.started
+    options = wandb.init.call_args.kwargs
     assert (options["mode"], options["project"], options["dir"]) == ("offline", "mine", str(folder))
     assert options["name"] == "cfp-sac-shapematch-quick-0" and options["config"]["batch_size"] == 4
-    assert ("*", "step") in wandb.steps and wandb.finished == 1
-    names = {name for point in wandb.points for name in point} - {"step"}
+    wandb.define_metric.assert_called_with("*", step_metric="step")
+    wandb.finish.assert_called_once()
+    points = [call.args[0] for call in wandb.log.call_args_list]
+    names = {name for point in points for name in point} - {"step"}
     tags = events(finished).Tags()
     assert names == set(tags["scalars"]) | set(tags["images"])
-    last = [point for point in wandb.points if "picture/gate" in point][-1]
+    last = [point for point in points if "picture/gate" in point][-1]
     assert last["step"] == 150 and last["picture/gate"] == ("image", (192, 386, 3))
-    assert all(value is not None for point in wandb.points for value in point.values())
+    assert all(value is not None for point in points for value in point.values())
     assert resume(folder, "--steps", "160") == 0
-    assert wandb.started[1]["id"] == options["id"] and wandb.started[1]["resume"] == "allow"
+    resumed = wandb.init.call_args.kwargs
+    assert resumed["id"] == options["id"] and resumed["resume"] == "allow"
 
 
 def test_weights_and_biases_that_is_not_installed_is_refused_at_once(monkeypatch, tmp_path, capsys):

@@ -8,6 +8,7 @@ import shutil
 import signal
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,12 +16,12 @@ import torch
 from tiny_runs import OF_LEARNER, ONE_STAGE, TABLES, assert_same_run, resume, run
 from watching import at_step, interrupt
 
-from cfp import evaluate, registry
+from cfp import registry
 from cfp.config import to_json
 from cfp.evaluation.returns import Played, Result
 from cfp.experiment import callbacks
 from cfp.experiment.checkpoint import Checkpoint
-from cfp.policy import read_policy, write_policy
+from cfp.policy import read_policy
 from cfp.tables import read_table
 from cfp.train import parse
 from dittogym.render.frame import png
@@ -91,12 +92,11 @@ def test_the_end_of_a_run_names_an_earlier_stage_that_returns_more(finished, tmp
     assert named(zero_action=0.0, random_action=0.0, stage_1=1.0, stage_2=2.0) == []
 
 
-@pytest.mark.parametrize(("learner", "within", "boundary"), [("sac", 44, 70), ("analytic", 64, 48)])
-def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(
-    learner, within, boundary, tmp_path, request, capsys
-):
+# The first stop of soft actor-critic is in its random phase; one of each learner is between the stages.
+@pytest.mark.parametrize(("learner", "stops"), [("sac", (8, 44, 70)), ("analytic", (48, 64))])
+def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(learner, stops, tmp_path, request, capsys):
     whole = request.getfixturevalue("finished" if learner == "sac" else "finished_analytic")
-    folder, stops = tmp_path / "stopped", sorted((within, boundary))
+    folder = tmp_path / "stopped"
 
     def kill():
         raise RuntimeError("killed")
@@ -104,12 +104,13 @@ def test_run_that_is_stopped_and_killed_goes_on_as_if_nothing_had_happened(
     with at_step(stops[0], interrupt):
         assert run(folder, learner=learner) == 128 + signal.SIGINT
     assert "--resume" in capsys.readouterr().out
-    with at_step(stops[1], terminate):
-        assert resume(folder) == 128 + signal.SIGTERM
-    assert f"resuming {folder} at step {stops[0]}" in capsys.readouterr().out
+    for before, stop in pairwise(stops):
+        with at_step(stop, terminate):
+            assert resume(folder) == 128 + signal.SIGTERM
+        assert f"resuming {folder} at step {before}" in capsys.readouterr().out
     with at_step(88, kill), pytest.raises(RuntimeError, match="killed"):
         resume(folder)
-    assert f"resuming {folder} at step {stops[1]}" in capsys.readouterr().out
+    assert f"resuming {folder} at step {stops[-1]}" in capsys.readouterr().out
     assert resume(folder) == 0  # from its last checkpoint
     assert_same_run(folder, whole)
 
@@ -220,7 +221,8 @@ def test_a_training_that_diverges_says_that_its_checkpoint_is_whole(tmp_path, ca
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(callbacks.StopCallback, "_on_step", act)
         assert run(folder) == 1
-    assert "; the last checkpoint is untouched" in capsys.readouterr().err
+    error = capsys.readouterr().err  # without a bar, which is for long trainings where there is no terminal
+    assert error.startswith("error: ") and error.endswith("; the last checkpoint is untouched\n")
     state = Checkpoint(folder / "checkpoint").read()
     assert state["num_timesteps"] == 40
     assert all(bool(weights.isfinite().all()) for weights in state["learner"]["policy"].values())
@@ -245,22 +247,10 @@ def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_
     assert_same_run(folder, finished, TABLES)
 
 
-@pytest.mark.parametrize("changes", [{"task": "run"}, {"resolution": 16}])
-def test_policy_of_another_run_is_refused(finished, tmp_path, capsys, changes):
-    path = shutil.copytree(finished, tmp_path / "run") / "policy.safetensors"
-    tensors, description = read_policy(path)
-    write_policy(path, tensors, description | changes)
-    assert evaluate.main([str(tmp_path / "run"), "--episodes", "1", "--device", "cpu"]) == 2
-    error = capsys.readouterr().err
-    assert f"{path}: " in error and str(next(iter(changes.values()))) in error and "stage 2 of this run" in error
-
-
 def test_first_stage_of_other_resolutions_is_refused(finished, tmp_path, capsys):
-    folder = tmp_path / "run"
-    assert run(folder, *SHORT, "--resolutions", "8", "16") == 0
-    for suffix in ("safetensors", "json"):
-        (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
-    assert resume(folder, "--steps", "50") == 2
+    folder = shutil.copytree(finished, tmp_path / "run")
+    shutil.copy(folder / "policy.safetensors", folder / "stage1.safetensors")
+    assert resume(folder, "--steps", "160") == 2
     assert "stage1.safetensors: weights and description do not match" in capsys.readouterr().err
 
 

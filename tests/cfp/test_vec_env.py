@@ -46,6 +46,8 @@ def test_first_episodes_are_truncated_at_different_ages_and_a_state_continues_th
     other.reset()
     other.load_state_dict(env.state_dict())
     assert lengths(other, 10) == lengths(env, 10) == [[4], [1, 7]]
+    with pytest.raises(ValueError, match="state must hold tensors of shapes"):
+        TorchVecEnv(FakeEnv(num_envs=3), max_episode_steps=6).load_state_dict(env.state_dict())
 
 
 def test_episodes_are_never_longer_than_the_horizon():
@@ -125,22 +127,6 @@ def test_options_that_differ_are_refused(others):
 def test_a_limit_of_no_steps_is_refused(steps):
     with pytest.raises(ValueError, match=f"max_episode_steps must be at least 1, got {steps}"):
         TorchVecEnv(FakeEnv(num_envs=2), max_episode_steps=steps)
-
-
-def test_episode_in_progress_can_be_put_back():
-    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=9))
-    env.reset()
-    env.step(actions(env, 0.5))
-    state = env.state_dict()
-    expected = env.step(actions(env, 0.25))
-    other = TorchVecEnv(FakeEnv(num_envs=2, horizon=9))
-    other.reset()
-    other.load_state_dict(state)
-    got = other.step(actions(env, 0.25))
-    np.testing.assert_array_equal(got[0], expected[0])
-    np.testing.assert_array_equal(got[1], expected[1])
-    with pytest.raises(ValueError, match="state must hold tensors of shapes"):
-        TorchVecEnv(FakeEnv(num_envs=3)).load_state_dict(state)
 
 
 def test_elements_share_attributes_and_pictures_come_one_by_one():
