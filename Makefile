@@ -28,8 +28,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing torchmpm and its tools ..."
 	@$(PIP) -e ".[dev,minari,play,video]"
 	@# On all cores at once; pip uses one. No harm if a file fails, as torch's for Python 3.12 does in older versions:
-	@# modules are compiled on import, too.
-	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true
+	@# modules are compiled on import, too. -W: some packages have syntax that newer Pythons warn of.
+	@$(BIN)/python -W ignore -m compileall -q -j 0 .venv/lib >/dev/null || true
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)

@@ -197,6 +197,7 @@ def test_task_and_duration_of_a_step_must_be_those_of_the_training(task, own, he
         ("run-rewards", [0.7482649, 0.8929546], 2.776267),
         ("shapematch", [-0.0237988, 0.1482136], -92.028098),
         ("slot", [0.2086875, 0.2795640], 21.970284),
+        ("slot-success", [0.1976125, 0.2541370], 22.108836),
     ],
 )
 def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
