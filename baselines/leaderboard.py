@@ -128,7 +128,7 @@ def candidates(name: str, tasks: Sequence[str]) -> list[tuple[dict[str, Any], Po
         description = policy.description
         task = description["task"]
         found = {task: policy}
-        check_trained_for("policies", description, task, ENVIRONMENT)
+        check_trained_for(f"policies: {name}", description, task, ENVIRONMENT)
         about = {
             "policy": _shown_name(name, task),
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),

@@ -165,7 +165,8 @@ def test_action_noise_of_the_policy_is_an_option_and_has_rows_of_its_own(folder,
 def test_policy_for_another_control_step_is_refused(folder, tmp_path, capsys):
     save(folder, config=replace(CONFIG, substeps=50))
     assert command(folder, tmp_path / "rows.csv") == 2
-    assert "policies must be a policy for environment steps of 0.01 s, got 0.005" in capsys.readouterr().err
+    expected = f"policies: {folder} must be a policy for environment steps of 0.01 s, got 0.005"
+    assert expected in capsys.readouterr().err
 
 
 def test_policies_of_two_tasks_of_one_name_are_refused(tmp_path, monkeypatch, capsys):
