@@ -1,8 +1,8 @@
 """Films of the policies that come with the package: `python docs/media.py [POLICY ...]`.
 
 Each policy gets `images/films/POLICY.webp`, that of OBSTACLE some moments beside each other in `images/hero.png`, and
-those of all tasks together `images/tasks.webp`. The hash of the policy behind each film is kept in
-`images/films/sources.json`; a test compares them with those of the package.
+those of all tasks together, of two policies the one that reaches the goal, `images/tasks.webp`. The hash of the policy
+behind each film is kept in `images/films/sources.json`; a test compares them with those of the package.
 """
 
 import argparse
@@ -101,7 +101,8 @@ def main() -> None:
         sources[name] = policy_hash(name)
     if HERO in (names or recordings):
         Image.fromarray(moments(recordings[HERO])).save(IMAGES / "hero.png", optimize=True)
-    write_film(IMAGES / "tasks.webp", grid_frames({task: recordings[task] for task in dittogym.TASKS}), RATE)
+    solved = {task: recordings.get(f"{task}-success", recordings[task]) for task in dittogym.TASKS}
+    write_film(IMAGES / "tasks.webp", grid_frames(solved), RATE)
     SOURCES.write_text(json.dumps(dict(sorted(sources.items())), indent=2) + "\n")
 
 

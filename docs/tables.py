@@ -87,7 +87,7 @@ def estimate(row: Row) -> str:
 
 
 #: Tasks whose policy was preferred to others by episodes from its own start that are in the table, which flatters them.
-CHOSEN_ON_OWN_START = ("dig", "kick", "obstacle", "shapematch")
+CHOSEN_ON_OWN_START = ("dig", "grow", "kick", "obstacle", "shapematch")
 
 
 def compared(row: Row, theirs: int) -> str:
