@@ -1,5 +1,6 @@
 """Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,7 +14,8 @@ from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from cfp.envs.make import make_torch_env
-from cfp.errors import ConfigError
+from cfp.envs.vec_env import NO_REWARD
+from cfp.errors import ConfigError, NonFiniteError
 from cfp.learner import Scalars, Sees
 from cfp.presets import sac_preset
 from dittogym import TorchEnv, make_spec
@@ -200,7 +202,7 @@ class MPC(OpenLoopLearner):
         return OpenLoop(self.actions, {"layout": self.config.seed})
 
     def update(self) -> Scalars:
-        """Carry out one more step."""
+        """Carry out one more step; a `NonFiniteError` if its reward is not finite."""
         if self.surrogate and self.planner.needs_plan:
             self.surrogate.sync(self.env.env_state)
         action = self.planner.act().float()  # as the record keeps it, so that it repeats the episode exactly
@@ -218,6 +220,8 @@ class MPC(OpenLoopLearner):
     def _carry_out(self, action: Tensor) -> None:
         _, reward, terminated, _, _ = self.env.step(action)
         self.reward = float(reward)
+        if not math.isfinite(self.reward):
+            raise NonFiniteError(NO_REWARD)
         self.total_reward += self.reward
         self.finished = bool(terminated)
 

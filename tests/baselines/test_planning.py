@@ -11,8 +11,8 @@ from baselines.common.rollout import rollout, soft_step
 from baselines.planning.gradient import clip_steps
 from baselines.planning.mpc import MPC, MPCConfig, Surrogate
 from cfp.envs.make import make_torch_env
-from cfp.errors import ConfigError
-from dittogym import TASKS, TorchEnv, core
+from cfp.errors import ConfigError, NonFiniteError
+from dittogym import TASKS, Reward, TorchEnv, core, make_spec
 
 
 def small(task="run", num_envs=1, **options):
@@ -273,6 +273,17 @@ def test_record_repeats_the_episode():
         action, memory = mpc.trained_policy.predict(images.numpy(), memory)
         env.step(torch.as_tensor(action))
     assert torch.equal(env.state.x, mpc.env.state.x)
+
+
+def test_a_reward_that_is_not_finite_ends_the_planning(monkeypatch):
+    def undefined(transition, spec):
+        return Reward({"far": torch.nan * transition.now.com[:, 0]})
+
+    spec = replace(make_spec("run"), name="nan", reward_fn=undefined, weights={"far": 1.0})
+    monkeypatch.setitem(TASKS, "nan", lambda: spec)
+    expected = pytest.raises(NonFiniteError, match="the reward function of the task returned NaN")
+    with pytest.warns(UserWarning, match="no gradient of a plan was finite"), expected:
+        MPC(replace(PLANNED, task="nan")).update()
 
 
 def test_learning_stops_with_the_episode():
