@@ -174,7 +174,8 @@ def plan(command: Command, given: str) -> list[Evaluation]:
     file = policy_file(given)
     config, policies = open_policy(given, command.device, None)
     config, policy = replace(config, dt=DT, substeps=None, dtype="float32"), policies[file.stem]
-    check_trained_for(f"policies: {given}", policy.description, config.task, config.environment)  # the control step
+    # The task is the policy's own, but its control step may be another.
+    check_trained_for(f"policies: {given}", policy.description, config.task, config.environment)
     spec = config.make_spec()
     name = given if is_address(given) else file.resolve().parent.name if file.stem == "policy" else file.stem
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
