@@ -216,8 +216,8 @@ def planning() -> str:
 
 
 def shipped() -> list[Row]:
-    """Rows of `evaluations.csv` about the task's own starts, in the form of `returns.csv`."""
-    own = (row for row in read("evaluations.csv") if row["case"] == OWN_START)
+    """Rows of `evaluations.csv` about the task's own starts and noisy actions, in the form of `returns.csv`."""
+    own = (row for row in read("evaluations.csv") if (row["case"], row["noise"]) == (OWN_START, "with"))
     return [row | {"algorithm": f'`cfp.load("{row["policy"]}")`', "observes": "image"} for row in own]
 
 
