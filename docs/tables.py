@@ -11,7 +11,6 @@ import json
 import math
 import pkgutil
 import re
-import statistics
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -72,13 +71,6 @@ def evaluated(task: str, policy: str, case: str, particles: str, noise: str = ""
     key = task, policy, case, particles
     rows = (row for row in read("evaluations.csv") if tuple(row[name] for name in KEY[1:5]) == key)
     return next((row for row in rows if noise in ("", row["noise"])), dict.fromkeys(COLUMNS, ""))
-
-
-def spread(row: Row) -> str:
-    """What is known about the spread of the episodes: lowest and highest, or the standard deviation."""
-    if row.get("lowest") and row["lowest"] != row["highest"]:
-        return f" ({number(row['lowest'])} to {number(row['highest'])})"
-    return f" ± {number(row['std'])}" if float(row.get("std") or 0) else ""
 
 
 def estimate(row: Row) -> str:
@@ -151,19 +143,13 @@ def evaluations() -> str:
     lines = []
     found = dict.fromkeys((row["task"], row["policy"], row["noise"]) for row in rows if row["sha256"])
     for task, policy, noise in sorted(found, key=lambda key: [*dittogym.TASKS].index(key[0])):
-        lite, full, own = (
-            evaluated(task, policy, *case, noise)
-            for case in ((UNDISTURBED, "lite"), (UNDISTURBED, "full"), (OWN_START, "full"))
-        )
-        theirs = paper.CURVES[task][0][0]
+        lite, full = (evaluated(task, policy, UNDISTURBED, particles, noise) for particles in ("lite", "full"))
         lines.append(
             [
                 name_of(task),
                 f"`{policy}`" + ", mean action" * (noise == "without"),
-                *(estimate(evaluated(task, kind, UNDISTURBED, "lite")) for kind in ("zero", "random")),
+                estimate(evaluated(task, "random", UNDISTURBED, "lite")),
                 *(estimate(row) for row in (lite, full)),
-                compared(own, theirs),
-                f"{theirs:,}",
                 pair(lite, full, "success"),
                 pair(lite, full, "success_whole"),
                 pair(lite, full, "piece"),
@@ -178,7 +164,7 @@ def evaluations() -> str:
                 ),
             ]
         )
-    heads = ("", "policy", "zero actions", "random actions", "return, lite", "full", "own start", "paper's CFP")
+    heads = ("", "policy", "random actions", "return, lite", "full")
     return markdown((*heads, "success, lite / full", "and not torn", "one piece", *RATIOS), lines)
 
 
@@ -194,38 +180,18 @@ def dropout() -> str:
     return markdown(("", *map(name_of, dittogym.TASKS)), lines)
 
 
-def planning() -> str:
-    """Returns of planners and of optimised action sequences with full particles."""
-    rows = [row for row in read("returns.csv") if row["particles"] == "full" and row["minutes"]]
-    return markdown(
-        ("Task", "Algorithm", "Episodes", "Return", "Paper's CFP", "Steps", "Minutes"),
-        (
-            [
-                name_of(row["task"]),
-                row["algorithm"],
-                row["episodes"],
-                number(row["mean"]) + spread(row),
-                f"{paper.CURVES[row['task']][0][0]:,}",
-                number(row["steps"]),
-                row["minutes"],
-            ]
-            for row in rows
-            if row["observes"] in ("simulator", "nothing")
-        ),
-    )
-
-
 def shipped() -> list[Row]:
     """Rows of `evaluations.csv` about the task's own starts and noisy actions, in the form of `returns.csv`."""
     own = (row for row in read("evaluations.csv") if (row["case"], row["noise"]) == (OWN_START, "with"))
-    return [row | {"algorithm": f'`cfp.load("{row["policy"]}")`', "observes": "image"} for row in own]
+    first = (row for row in own if row["policy"] == row["task"])
+    return [row | {"algorithm": "`cfp.load(task)`", "observes": "image"} for row in first]
 
 
 def returns() -> str:
     """Mean returns of all algorithms in all tasks with full particles, from the evaluations with the most episodes."""
     cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in (*shipped(), *read("returns.csv")):
-        label = re.sub(r", .*", "`", row["algorithm"]).replace(f'("{row["task"]}")', "(task)")
+        label = re.sub(r", .*", "`", row["algorithm"])
         label = "`distill`" if "distill" in row["algorithm"] else label.replace("``", "`").strip()
         if row["particles"] == "full" and "target" not in row["algorithm"]:
             cells.setdefault((row["observes"], label), {}).setdefault(row["task"], []).append(row)
@@ -250,20 +216,6 @@ def published() -> str:
         for i, name in enumerate(paper.COLUMNS)
     )
     return markdown(("Algorithm", *map(name_of, paper.CURVES)), rows)
-
-
-def leaderboard() -> str:
-    """Mean returns under the fixed protocol, with half their 95 % interval, best first; reference policies apart."""
-    rows: dict[str, tuple[list[str], list[str]]] = {task: ([], []) for task in dittogym.TASKS}
-    entries = [json.loads(path.read_text()) for path in (DOCS / "leaderboard").glob("*.json")]
-    for entry in sorted(entries, key=lambda entry: -entry["scores"]["mean"]):
-        scores = entry["scores"]
-        good = f", success {scores['success']:.0%}" if scores["success"] else ""
-        ranked, references = rows[entry["task"]]
-        cell = ranked if entry["sha256"] else references
-        cell.append(f"{entry['policy']} {scores['mean']:,.0f} ± {scores['interval']:,.0f}{good}")
-    lines = ([name_of(task), *("; ".join(cell) for cell in cells)] for task, cells in rows.items() if any(cells))
-    return markdown(("Task", "Policies", "Reference policies"), lines)
 
 
 def pivot(
@@ -292,52 +244,6 @@ def ablation_rewards() -> str:
     rows = [row | {"mean": number(row["mean"])} for row in read("rewards-ablation.csv") if row["episodes"]]
     heads, lines = pivot(rows, ("change",), ("task",), "mean")
     return markdown(("Left out or changed", *(name_of(task) for (task,) in heads)), lines)
-
-
-def trainings(rows: Iterable[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
-    """Evaluations of each training, by the columns that tell trainings apart."""
-    found: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        found.setdefault(tuple(row[name] for name in names), []).append(row)
-    return found
-
-
-def highest(evaluations: Iterable[Row]) -> Row:
-    """The evaluation with the highest return."""
-    return max(evaluations, key=lambda row: float(row["mean"]))
-
-
-def refined_run() -> str:
-    """Returns of policies of RUN before they were refined and at the highest evaluation of that training, by seed."""
-    cells = []
-    for (changed, seed), (before, *later) in trainings(read("run-seeds.csv"), "changed", "seed").items():
-        if "refined" in changed:
-            ends = (f"{number(row['mean'])} ({share(row['success'])})" for row in (before, highest(later)))
-            cells.append({"changed": changed, "seed": seed, "cell": " → ".join(ends)})
-    heads, lines = pivot(cells, ("changed",), ("seed",), "cell")
-    return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), lines)
-
-
-def weight_averages() -> str:
-    """Returns and success of means of policies of SHAPE MATCH, by the weights of the policies."""
-    index = "varied", "successful", "successful then varied"
-    cells = [row | {"cell": f"{estimate(row)}, {share(row['success'])}"} for row in read("weight-averages.csv")]
-    heads, lines = pivot(cells, index, ("case", "particles"), "cell")
-    return markdown((*index, *(", ".join(head) for head in heads)), lines)
-
-
-def rewards_long() -> str:
-    """Highest evaluation of trainings from rewards over at least 60,000 steps, and the mean of their last three."""
-    cells = []
-    for (task, n, change, seed), rows in trainings(read("rewards-long.csv"), "task", "cells", "change", "seed").items():
-        if int(rows[-1]["step"]) >= 60000:
-            best, last = highest(rows), statistics.fmean(float(row["mean"]) for row in rows[-3:])
-            change = re.sub(r"\d{4,}", lambda digits: number(digits[0]), change)
-            what = ", ".join(filter(None, (name_of(task), f"{n} × {n}", change)))
-            cell = f"{number(best['mean'])} at {number(best['step'])}; {last:,.0f}"
-            cells.append({"what": what, "seed": seed, "cell": cell})
-    heads, lines = pivot(cells, ("what",), ("seed",), "cell")
-    return markdown(("Training", *(f"Seed {seed}" for (seed,) in heads)), sorted(lines))
 
 
 def best_rewards() -> str:
@@ -540,17 +446,12 @@ TABLES: dict[str, Callable[..., str]] = {
     "geometry": geometry,
     "gpu": gpu,
     "gpu-line": gpu_line,
-    "leaderboard": leaderboard,
     "metrics": metrics,
-    "planning": planning,
     "published": published,
-    "refined-run": refined_run,
     "results": results,
     "returns": returns,
-    "rewards-long": rewards_long,
     "tasks": tasks,
     "verification": verification,
-    "weight-averages": weight_averages,
 }
 
 

@@ -72,13 +72,11 @@ PAGES = {
     ),
     "docs/concepts/gradients.md": (
         "assert gradient.abs().max() > 0",
-        "assert (logs.exp() - torch.tensor([3e4, 2e4])).abs().max() < 100",
     ),
     "docs/concepts/planning.md": ("assert planner.num_plans > 0 and planner.num_failed == 0",),
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
         "assert material.net[0].weight.grad.abs().max() > 0 and friction.grad < 0",
-        "assert pull.grad.flatten(1).norm(dim=1).min() > 0",
         "assert policy.actions.shape == (30, 2, 32, 32) and (folder / 'index.html').exists()",
     ),
 }
