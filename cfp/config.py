@@ -81,7 +81,7 @@ class TaskConfig:
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
-    """cpu, cuda, or auto."""
+    """cpu, cuda, or auto, which chooses one; only a GPU that is named changes the defaults of other options."""
 
 
 @dataclass(frozen=True, kw_only=True)
