@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
@@ -327,32 +327,6 @@ def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
     return 1.0 - (1.0 - final) * progress
 
 
-class AveragedWeights(AveragedModel):
-    """Exponential average of a module's weights, from those after its first update on.
-
-    It counts on the host as well, where torch's own makes a GPU wait in every update.
-
-    Args:
-        module: Is copied.
-        decay: Of the average.
-    """
-
-    def __init__(self, module: nn.Module, decay: float) -> None:
-        super().__init__(module, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        self._average = get_ema_multi_avg_fn(decay)
-        self._has_begun = False
-
-    def update_parameters(self, model: nn.Module) -> None:
-        """Take the weights of ``model`` into the average."""
-        if self._has_begun:
-            self._average(list(self.module.parameters()), list(model.parameters()), 1)
-            self.n_averaged += 1
-        else:
-            super().update_parameters(model)
-            self._has_begun = True
-
-    def load_state_dict(self, *state: Any, **options: Any) -> Any:
-        """Restore a state, see torch."""
-        result = super().load_state_dict(*state, **options)
-        self._has_begun = int(self.n_averaged) > 0
-        return result
+def follow(average: nn.Module, module: nn.Module, decay: float) -> None:
+    """Move the weights of an exponential ``average`` towards those of a ``module``, by ``1 - decay`` of the way."""
+    get_ema_multi_avg_fn(decay)(list(average.parameters()), list(module.parameters()), 1)

@@ -5,8 +5,9 @@ The policy sees the image only. The critic sees the state of the simulation, and
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import AveragedWeights, CoarseToFine, NetworksPolicy, UpdateLoop, linear_decay, refines
+from cfp.learner import CoarseToFine, NetworksPolicy, UpdateLoop, follow, linear_decay, refines
 from cfp.presets import analytic_preset
 from cfp.resumable import Resumable, compress, decompress
 
@@ -137,8 +138,8 @@ class Regression(Resumable):
     parts = ("actor", "average", "adam")
 
     def __init__(self, actor: Actor, learning_rate: float, decay: float, max_grad_norm: float) -> None:
-        self.actor, self.max_grad_norm = actor, max_grad_norm
-        self.average = AveragedWeights(actor, decay)
+        self.actor, self.decay, self.max_grad_norm = actor, decay, max_grad_norm
+        self.average = copy.deepcopy(actor).requires_grad_(False)
         self.adam = make_adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
 
     def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> tuple[Tensor, Tensor]:
@@ -152,7 +153,7 @@ class Regression(Resumable):
         loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)
         loss.backward()
         norm = descend(self.adam, self.max_grad_norm)
-        self.average.update_parameters(self.actor)
+        follow(self.average, self.actor, self.decay)
         return loss.detach(), norm
 
 
@@ -336,7 +337,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     @property
     def trained_actor(self) -> Actor:
         """The actor with averaged weights."""
-        return cast(Actor, self.regression.average.module)
+        return self.regression.average
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "regression.adam", "critic.adam"], []
