@@ -30,6 +30,7 @@ from cfp.policy import (
     KIND,
     ActorPolicy,
     Policy,
+    attached,
     copy_policy,
     load,
     policy_for,
@@ -120,6 +121,11 @@ class Learner(ABC):
     def trained_policy(self) -> Policy:
         """What has been learned so far, as `save_policy` writes it."""
 
+    @property
+    def acting_policy(self) -> Policy:
+        """The same to act by now, not to keep: it may share its weights with what is in training."""
+        return self.trained_policy
+
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
         policy = cast(Shareable, self.trained_policy)
@@ -136,30 +142,23 @@ class Learner(ABC):
 
 
 class NetworksPolicy(BasePolicy):
-    """The networks of an `UpdateLoop`, as the policy that stable-baselines3 saves and that ``predict`` acts by.
+    """The networks of an `UpdateLoop`, as the policy that stable-baselines3 saves; the algorithm's ``predict`` acts.
 
     Args:
         observation_space: Of the environment.
         action_space: Of the environment.
-        actor: Maps observations (B, ...) to actions, without noise if its second argument is True.
-        networks: All others, by name.
+        networks: By name.
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        actor: nn.Module,
-        **networks: nn.Module,
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], **networks: nn.Module
     ) -> None:
         super().__init__(observation_space, cast(spaces.Box, action_space), normalize_images=False)
-        self.actor = actor
         for name, network in networks.items():
             self.add_module(name, network)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        action: Tensor = self.actor(observation, deterministic)
-        return action
+        raise NotImplementedError("call predict of the algorithm, which prepares images or looks at the simulation")
 
 
 class UpdateLoop(BaseAlgorithm, Learner):
@@ -238,6 +237,24 @@ class UpdateLoop(BaseAlgorithm, Learner):
         self._callback.on_training_end()
         return self
 
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Act by what has been learned so far, with the signature of stable-baselines3's ``predict``.
+
+        Args:
+            observation: Images of the environment; a policy of the state looks at the simulation instead.
+            state: Memory of the policy, if it has one.
+            episode_start: (B,) bool.
+            deterministic: Act without noise.
+
+        Returns:
+            Actions, and the memory for the next call.
+        """
+        policy = self.acting_policy if self.env is None else attached(self.acting_policy, self.simulation)
+        actions, memory = policy.predict(observation, state, episode_start, deterministic)
+        return actions, memory
+
     def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""
         self.num_timesteps += len(done)
@@ -287,7 +304,16 @@ class CoarseToFine(Learner):
     @property
     def trained_policy(self) -> ActorPolicy:
         """What has been learned so far."""
-        return ActorPolicy(self.config.actor_spec(self.stage), self.config.eval_deterministic, self.trained_actor)
+        return self._policy(shared=False)
+
+    @property
+    def acting_policy(self) -> ActorPolicy:
+        """The same to act by now, not to keep: a copy of the networks would take longer than an action."""
+        return self._policy(shared=True)
+
+    def _policy(self, shared: bool) -> ActorPolicy:
+        spec, deterministic = self.config.actor_spec(self.stage), self.config.eval_deterministic
+        return ActorPolicy(spec, deterministic, self.trained_actor, shared)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:

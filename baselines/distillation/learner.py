@@ -285,7 +285,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         self.actor.fix_std()
         self.actor.to(self.device)
         self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
-        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor)
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=self.actor)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
 
@@ -385,12 +385,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """Act on an ``observation``, see stable-baselines3's ``predict``: without noise if ``deterministic``.
-
-        Actions are enlarged to the grid of the algorithm's environment; ``state`` is returned as it is, and
-        ``episode_start`` has no effect, as the policy has no memory.
-        """
-        actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
+        """Act as `cfp.learner.UpdateLoop.predict` does, on the grid of the algorithm's environment."""
+        actions, state = super().predict(observation, state, episode_start, deterministic)
         patch = self.config.make_spec().patch
         return project(torch.from_numpy(actions), patch, patch).numpy(), state
 

@@ -189,7 +189,8 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             critic = mlp(self.features.size(len(config.make_spec().bodies) - 1), 1).to(self.device)
         self.critic = Critic(critic, config)
         networks = {"learned": self.actor, "value": critic, "target": self.critic.target}
-        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.trained_actor, **networks)
+        actor = self.trained_actor
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=actor, **networks)
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
@@ -319,12 +320,6 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             )
         improved = self.action_step(actions, gradients, step_size)
         return torch.cat(images), improved, window
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
-        """Act on an ``observation`` by the actor with averaged weights, see `cfp.ActorPolicy.predict`."""
-        return self.trained_policy.predict(observation, state, episode_start, deterministic)
 
     def log_row(self) -> None:
         """Begin the mean return of the next row."""

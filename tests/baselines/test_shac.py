@@ -160,6 +160,16 @@ def test_policy_goes_through_its_file(tmp_path):
     assert results[0] == results[1]
 
 
+def test_algorithm_acts_on_the_state_of_its_own_simulation(tmp_path):
+    learner = make("shapematch", grid=8, num_envs=2)
+    images = learner.simulation.observation().numpy()
+    wanted = learner.trained_policy.attached(learner.simulation).predict(images, deterministic=True)[0]
+    assert np.array_equal(learner.predict(images, deterministic=True)[0], wanted)
+    learner.save(tmp_path / "model.zip")
+    with pytest.raises(RuntimeError, match=r"call attached\(env\) first"):
+        Shac.load(tmp_path / "model.zip").predict(images)
+
+
 @pytest.mark.parametrize("left_out", ["deformation", "clock"])
 def test_files_of_policies_that_observe_less_load(tmp_path, left_out):
     """Options for which there was no use once trained such policies."""

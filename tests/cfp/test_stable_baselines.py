@@ -135,6 +135,25 @@ def test_average_of_a_loaded_model_goes_on_from_the_weights_that_it_had(algorith
     assert all(torch.equal(averages[1][name], value) for name, value in averages[0].items())
 
 
+def test_predict_acts_by_the_networks_in_training_and_leaves_them_as_they_are():
+    model = make(CFPAnalytic)
+    images = np.random.default_rng(0).integers(0, 256, (2, 3, 64, 64), dtype=np.uint8)
+    kept, trained = model.trained_policy, len(model.actor.trainable_parameters())
+    before = model.predict(images, deterministic=True)[0]
+    assert np.array_equal(kept.predict(images, deterministic=True)[0], before)
+    model.learn(16)
+    after = model.predict(images, deterministic=True)[0]
+    assert not np.array_equal(after, before) and np.array_equal(model.predict(images, deterministic=True)[0], after)
+    assert np.array_equal(kept.predict(images, deterministic=True)[0], before)
+    assert len(model.actor.trainable_parameters()) == trained > 0
+
+
+def test_networks_refuse_to_act_on_what_predict_has_not_prepared():
+    """Images with missing pixels, for instance."""
+    with pytest.raises(NotImplementedError, match="call predict of the algorithm"):
+        make(CFPAnalytic).policy.predict(np.zeros((3, 64, 64), np.uint8))
+
+
 @pytest.mark.parametrize(("taken", "over"), [((32,), 64), ((32, 64), 96)])
 def test_rates_fall_over_the_stage_or_over_the_steps_that_are_taken_if_they_are_more(taken, over):
     model = make(CFPAnalytic)
