@@ -403,7 +403,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
 
     @staticmethod
     def preset(task: str, name: str) -> DistillConfig:
-        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
+        """Defaults of a task: grids and gates of the same preset of ``cfp-sac``, but always the paper's networks.
 
         Both presets teach with lite particles; ``quick`` is evaluated there, ``paper`` in the paper's environment.
         SHAPE MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
