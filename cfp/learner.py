@@ -280,7 +280,8 @@ class CoarseToFine(Learner):
         policy, refine = policy_for(config, config.start_from), config.refine
         stages, resolutions = len(policy.spec.resolutions), config.resolutions
         if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
-            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
+            rest = "" if refine else ", but not all of them without refine"
+            allowed = f"the first resolutions of {resolutions}{rest}"
             raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
         if policy.spec.encoder != config.encoder:
             raise ConfigError(f"start_from must be a policy with encoder {config.encoder}, got {policy.spec.encoder}")
