@@ -164,7 +164,7 @@ def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Tab
         *columns(",d", steps="steps"),
         *columns(",.1f", minutes="minutes"),
     )
-    return Table("returns", "Returns", description, shown, rows)
+    return Table("Returns", description, shown, rows)
 
 
 def draw(results: Sequence[Result], columns: int = 2) -> Figure:

@@ -156,7 +156,7 @@ def test_policy_goes_through_its_file(tmp_path):
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in policies]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     trials = [make_trial(learner.config, "", each, 2, deterministic=False, seed=3) for each in policies]
-    results = evaluate(trials)
+    results = evaluate(trials, 30)
     assert results[0] == results[1]
 
 
