@@ -24,7 +24,7 @@ from baselines.registry import configure, find
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import check_norms, descend
 from cfp.analytic.window import Episodes
-from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
+from cfp.config import TASK_OPTIONS, Particles, StagedConfig, check_training_seeds
 from cfp.envs.make import choose_device, make_env, make_torch_env, seeded
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError, check_at_least, check_fraction, check_positive
 from cfp.experiment.cli import StopSignals
@@ -97,11 +97,6 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Particle layouts that training episodes start from in turn; in GROW and OBSTACLE all are the same."""
     planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
-
-    def for_training(self: Config) -> Config:
-        """These options, with the environment that the student is taught in."""
-        assert isinstance(self, DistillConfig)
-        return self.simulated_with(self.train_particles)
 
     @property
     def planner_resolution(self) -> int:
