@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from cfp.agent.actor import Actor, SmallEncoder
+from cfp.agent.actor import Actor, ActorSpec, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
@@ -271,6 +271,7 @@ class CoarseToFine(Learner):
     """Learns the coarse-to-fine policy, each stage over the frozen policy of the coarser one (paper, Section 4.2)."""
 
     config: StagedConfig
+    spec: ActorSpec  # structure of the actor of the stage
 
     @classmethod
     def begin(cls, config: Any, folder: Path) -> tuple[int, int]:
@@ -313,8 +314,7 @@ class CoarseToFine(Learner):
         return self._policy(shared=True)
 
     def _policy(self, shared: bool) -> ActorPolicy:
-        spec, deterministic = self.config.actor_spec(self.stage), self.config.eval_deterministic
-        return ActorPolicy(spec, deterministic, self.trained_actor, shared)
+        return ActorPolicy(self.spec, self.config.eval_deterministic, self.trained_actor, shared)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
@@ -332,7 +332,7 @@ class CoarseToFine(Learner):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor with its frozen coarser stages."""
-        own = {"kind": KIND, "trained_by": self.config.algo, "network": asdict(self.config.actor_spec(self.stage))}
+        own = {"kind": KIND, "trained_by": self.config.algo, "network": asdict(self.spec)}
         write_policy(path, self.trained_actor.state_dict(), description | own)
 
 

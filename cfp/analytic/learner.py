@@ -180,8 +180,9 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def _setup_model(self) -> None:
         config = self.config
+        self.spec = config.actor_spec(self.stage)
         with seeded(config.seed):
-            self.actor = build_actor(config.actor_spec(self.stage)).to(self.device)
+            self.actor = build_actor(self.spec).to(self.device)
         self.actor.fix_std()  # its parameters are not the optimiser's
         self.regression = Regression(self.actor, config.learning_rate, config.weight_average, config.max_grad_norm)
         self.features = StateFeatures(displacement=config.displacement)
@@ -209,7 +210,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def observe(self) -> Tensor:
         """What the policy sees now, uint8 (B, 3, 64, 64)."""
-        return self.config.actor_spec(self.stage).filled(self.simulation.observation())
+        return self.spec.filled(self.simulation.observation())
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:

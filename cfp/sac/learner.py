@@ -639,8 +639,10 @@ class CFPSAC(SACLearner, CoarseToFine):
         tensors = choose_device(config.device) != "cpu"
         size, conditions = config.action_size(stage), config.conditions(stage)
         env = make_env(config, size, None, config.max_episode_steps, tensors, conditions=conditions)
-        learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": config.actor_spec(stage)})
+        spec = config.actor_spec(stage)
+        learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": spec})
         assert isinstance(learner, CFPSAC)
+        learner.spec = spec
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.networks()[0])
         learner.restart_average()
         learner.trains_encoder = not refines(config, folder, stage)
