@@ -196,7 +196,7 @@ def rankings(results: Iterable[dict[str, Any]]) -> list[Table]:
         better = sum(other["mean"] > row["mean"] for other in rivals if not is_reference(other))
         row["rank"] = "reference" if is_reference(row) else 1 + better
     description = f"Mean return of {len(SEEDS)} episodes under protocol {PROTOCOL}."
-    tables = (Table(task, task, description, SHOWN, [row for row in rows if row["task"] == task]) for task in TASKS)
+    tables = (Table(task, description, SHOWN, [row for row in rows if row["task"] == task]) for task in TASKS)
     return [table for table in tables if table.rows]
 
 

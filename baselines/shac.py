@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -154,7 +153,7 @@ class Shac(Resumable, UpdateLoop):
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
         networks = {"value": critic, "target": self.critic.target}
-        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor, **networks)
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=self.actor, **networks)
         if self.env is not None:  # a model can be loaded before it gets one
             self.begin_episodes()
 
@@ -219,13 +218,6 @@ class Shac(Resumable, UpdateLoop):
     def log_row(self) -> None:
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
-        """Act on the present state of the simulation, see `StatePolicy.predict`: without noise if ``deterministic``."""
-        policy = self.trained_policy.attached(self.simulation)
-        return policy.predict(observation, state, episode_start, deterministic)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor_adam", "critic.adam"], []

@@ -105,7 +105,7 @@ class GradientConfig(OptimisationConfig):
 
 
 class Objective:
-    """The negative smooth reward; in SHAPE MATCH, whose reward has no gradient, the difference from the target picture.
+    """The negative smooth reward; in SHAPE MATCH the difference from the target picture, which may be blurred.
 
     This is the mean absolute difference of the soft silhouette and the target, both blurred. A wide blur pulls matter
     towards a target that it does not touch, a narrow one shapes the outline.
@@ -172,8 +172,7 @@ class Gradient(Resumable, OpenLoopLearner):
         own, num_envs = (config, 1) if polishes else (config.for_training(), None)
         self.env = make_torch_env(own, config.resolution(stage), num_envs)
         self.env.reset(seed=config.seed)
-        if not matches_shape(self.env.spec):
-            check_differentiable(self.env)
+        check_differentiable(self.env)
         self.initial = self.env.save()
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)

@@ -81,7 +81,7 @@ class TaskConfig:
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
-    """cpu, cuda, or auto."""
+    """cpu, cuda, or auto, which chooses one; only a GPU that is named changes the defaults of other options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +127,8 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         return EnvironmentConfig(**{name: getattr(self, name) for name in names})
 
     def for_training(self: Config) -> Config:
-        """These options, with the environment that is trained in."""
-        return self
+        """These options, with the environment that is trained in, for algorithms that have options of it."""
+        return self.simulated_with(getattr(self, "train_particles", None), getattr(self, "train_dt", None))
 
     def simulated_with(
         self: Config, particles: Particles | None = None, dt: float | None = None, option: str = "train_dt"
@@ -507,11 +507,6 @@ class WindowConfig(RunConfig):
     success_reward: float = 0.0
     """Reward of each step in which the task is solved, which the critic values; an episode that ends with success is
     valued as if it went on so for 1 / (1 - gamma) steps, at most 100. 0: none."""
-
-    def for_training(self: Config) -> Config:
-        """These options, with the environment that is trained in."""
-        assert isinstance(self, WindowConfig)
-        return self.simulated_with(self.train_particles, self.train_dt)
 
     def check(self) -> None:
         """Check what the types do not express."""

@@ -46,7 +46,7 @@ class Command:
     seed: int | None = None
     """Seed of initial particle positions and noise; the run's own if not given."""
     particles: Particles | None = None
-    """Particles: full (the paper's), lite, or counts; the run's own if not given."""
+    """Particles, to be named after the folder: full (the paper's), lite, or counts; the run's own if not given."""
     dt: float | None = None
     """Duration of a substep, s; the run's own if not given."""
     device: str = "auto"

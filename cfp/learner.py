@@ -17,9 +17,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from cfp.agent.actor import Actor, SmallEncoder
+from cfp.agent.actor import Actor, ActorSpec, SmallEncoder
 from cfp.config import RunConfig, StagedConfig
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
@@ -30,6 +30,7 @@ from cfp.policy import (
     KIND,
     ActorPolicy,
     Policy,
+    attached,
     copy_policy,
     load,
     policy_for,
@@ -120,6 +121,11 @@ class Learner(ABC):
     def trained_policy(self) -> Policy:
         """What has been learned so far, as `save_policy` writes it."""
 
+    @property
+    def acting_policy(self) -> Policy:
+        """The same to act by now, not to keep: it may share its weights with what is in training."""
+        return self.trained_policy
+
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
         policy = cast(Shareable, self.trained_policy)
@@ -136,30 +142,23 @@ class Learner(ABC):
 
 
 class NetworksPolicy(BasePolicy):
-    """The networks of an `UpdateLoop`, as the policy that stable-baselines3 saves and that ``predict`` acts by.
+    """The networks of an `UpdateLoop`, as the policy that stable-baselines3 saves; the algorithm's ``predict`` acts.
 
     Args:
         observation_space: Of the environment.
         action_space: Of the environment.
-        actor: Maps observations (B, ...) to actions, without noise if its second argument is True.
-        networks: All others, by name.
+        networks: By name.
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        actor: nn.Module,
-        **networks: nn.Module,
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], **networks: nn.Module
     ) -> None:
         super().__init__(observation_space, cast(spaces.Box, action_space), normalize_images=False)
-        self.actor = actor
         for name, network in networks.items():
             self.add_module(name, network)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        action: Tensor = self.actor(observation, deterministic)
-        return action
+        raise NotImplementedError("call predict of the algorithm, which prepares images or looks at the simulation")
 
 
 class UpdateLoop(BaseAlgorithm, Learner):
@@ -238,6 +237,24 @@ class UpdateLoop(BaseAlgorithm, Learner):
         self._callback.on_training_end()
         return self
 
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Act by what has been learned so far, with the signature of stable-baselines3's ``predict``.
+
+        Args:
+            observation: Images of the environment; a policy of the state looks at the simulation instead.
+            state: Memory of the policy, if it has one.
+            episode_start: (B,) bool.
+            deterministic: Act without noise.
+
+        Returns:
+            Actions, and the memory for the next call.
+        """
+        policy = self.acting_policy if self.env is None else attached(self.acting_policy, self.simulation)
+        actions, memory = policy.predict(observation, state, episode_start, deterministic)
+        return actions, memory
+
     def after_step(self, done: np.ndarray, infos: list[dict[str, Any]]) -> bool:
         """Count a control step of all robots and tell the callbacks; False if one stops the training."""
         self.num_timesteps += len(done)
@@ -254,6 +271,7 @@ class CoarseToFine(Learner):
     """Learns the coarse-to-fine policy, each stage over the frozen policy of the coarser one (paper, Section 4.2)."""
 
     config: StagedConfig
+    spec: ActorSpec  # structure of the actor of the stage
 
     @classmethod
     def begin(cls, config: Any, folder: Path) -> tuple[int, int]:
@@ -263,7 +281,8 @@ class CoarseToFine(Learner):
         policy, refine = policy_for(config, config.start_from), config.refine
         stages, resolutions = len(policy.spec.resolutions), config.resolutions
         if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
-            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
+            rest = "" if refine else ", but not all of them without refine"
+            allowed = f"the first resolutions of {resolutions}{rest}"
             raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
         if policy.spec.encoder != config.encoder:
             raise ConfigError(f"start_from must be a policy with encoder {config.encoder}, got {policy.spec.encoder}")
@@ -287,7 +306,15 @@ class CoarseToFine(Learner):
     @property
     def trained_policy(self) -> ActorPolicy:
         """What has been learned so far."""
-        return ActorPolicy(self.config.actor_spec(self.stage), self.config.eval_deterministic, self.trained_actor)
+        return self._policy(shared=False)
+
+    @property
+    def acting_policy(self) -> ActorPolicy:
+        """The same to act by now, not to keep: a copy of the networks would take longer than an action."""
+        return self._policy(shared=True)
+
+    def _policy(self, shared: bool) -> ActorPolicy:
+        return ActorPolicy(self.spec, self.config.eval_deterministic, self.trained_actor, shared)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
@@ -305,7 +332,7 @@ class CoarseToFine(Learner):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor with its frozen coarser stages."""
-        own = {"kind": KIND, "trained_by": self.config.algo, "network": asdict(self.config.actor_spec(self.stage))}
+        own = {"kind": KIND, "trained_by": self.config.algo, "network": asdict(self.spec)}
         write_policy(path, self.trained_actor.state_dict(), description | own)
 
 
@@ -327,32 +354,6 @@ def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
     return 1.0 - (1.0 - final) * progress
 
 
-class AveragedWeights(AveragedModel):
-    """Exponential average of a module's weights, from those after its first update on.
-
-    It counts on the host as well, where torch's own makes a GPU wait in every update.
-
-    Args:
-        module: Is copied.
-        decay: Of the average.
-    """
-
-    def __init__(self, module: nn.Module, decay: float) -> None:
-        super().__init__(module, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        self._average = get_ema_multi_avg_fn(decay)
-        self._has_begun = False
-
-    def update_parameters(self, model: nn.Module) -> None:
-        """Take the weights of ``model`` into the average."""
-        if self._has_begun:
-            self._average(list(self.module.parameters()), list(model.parameters()), 1)
-            self.n_averaged += 1
-        else:
-            super().update_parameters(model)
-            self._has_begun = True
-
-    def load_state_dict(self, *state: Any, **options: Any) -> Any:
-        """Restore a state, see torch."""
-        result = super().load_state_dict(*state, **options)
-        self._has_begun = int(self.n_averaged) > 0
-        return result
+def follow(average: nn.Module, module: nn.Module, decay: float) -> None:
+    """Move the weights of an exponential ``average`` towards those of a ``module``, by ``1 - decay`` of the way."""
+    get_ema_multi_avg_fn(decay)(list(average.parameters()), list(module.parameters()), 1)

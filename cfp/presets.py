@@ -123,8 +123,8 @@ SAC: dict[str, dict[str, Any]] = {
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"gamma": 0.99, "gate_penalty": (0.01,)},
 }
-#: Options of the presets ``quick`` and ``long`` that differ on a GPU: as many robots as fill a card, and fewer but
-#: larger updates. Not chosen by measurements yet.
+#: Options of the presets ``quick`` and ``long`` that differ on a GPU that is named, not found by auto: as many
+#: robots as fill a card, and fewer but larger updates. Not chosen by measurements yet.
 GPU: dict[str, dict[str, Any]] = {
     "cfp-sac": {"num_envs": 1_024, "gradient_steps": 8, "batch_size": 4_096, "buffer_size": 1_000_000},
     "cfp-analytic": {"num_envs": 1_024, "minibatch_size": 2_048, "windows_kept": 4},

@@ -38,6 +38,8 @@ def find(name: str) -> type[Learner]:
 def configure(values: dict[str, Any]) -> RunConfig:
     """Options from JSON values; those that are left out come from the preset and the device that the values name.
 
+    The device auto has the options of a CPU, so that the same values are the same training on every machine.
+
     Raises:
         ConfigError: There is no such algorithm, task, preset or option, or a value is of another type.
     """
@@ -47,7 +49,8 @@ def configure(values: dict[str, Any]) -> RunConfig:
     if preset not in learner.presets:
         raise ConfigError(f"preset must be {' or '.join(learner.presets)} for {algo}, got {preset!r}")
     defaults = like_start(learner.preset(task, preset), values)
-    memory = gpu_memory(str(values.get("device", defaults.device)))
+    device = str(values.get("device", defaults.device))
+    memory = 0 if device == "auto" else gpu_memory(device)
     return update_from_dict(defaults if memory == 0 else for_gpu(defaults, memory), values)
 
 

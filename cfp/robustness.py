@@ -240,7 +240,7 @@ def make_table(rows: Sequence[Row], every: Sequence[Row]) -> Table:
         shown.append(row | numbers | {"case": case} | dict(zip(("ratio", "quotient"), ratios(row, every), strict=True)))
     own = rows[-1]
     title = f"{own['policy']} on {own['task']}"
-    return Table("robustness", title, f"Protocol {PROTOCOL}, {own['noise']} action noise.", SHOWN, shown)
+    return Table(title, f"Protocol {PROTOCOL}, {own['noise']} action noise.", SHOWN, shown)
 
 
 def run(command: Command) -> None:

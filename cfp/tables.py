@@ -112,9 +112,8 @@ def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values; ``name`` tells tables apart, ``title`` and ``description`` are for readers."""
+    """Rows of plain values under a title and a description."""
 
-    name: str
     title: str
     description: str
     columns: Sequence[Column]

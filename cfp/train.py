@@ -43,7 +43,7 @@ class Command:
 
     Default values come from the preset of algorithm, task and device, then from the --config file, then from the
     command line. This help shows those of one algorithm and task; --algo ALGO --task TASK --help shows those of others,
-    and --device cuda --help those on a GPU.
+    and --device cuda --help those on a GPU that is named.
 
     Ctrl-C writes a checkpoint and stops the run; --resume continues it.
     """
@@ -76,12 +76,16 @@ def parse(words: Sequence[str], module: str = "cfp.train", started: str | None =
     except ValueError:
         first.seed = None  # which is refused below
     values = _read_file(first.config)
-    values |= {name: value for name in DECISIVE if (value := getattr(first, name)) not in (None, False)}
+    values |= {name: value for name in DECISIVE if _is_given(value := getattr(first, name))}
     defaults, out = _defaults(values, None if first.out is None else parse_folder("out", first.out), first.resume)
     algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}.\nTasks: {', '.join(dittogym.TASKS)}."
     about = f"{inspect.cleandoc(Command.__doc__ or '')}\n\n{algorithms}"
     command = read_command(Command, module, EXAMPLES, words, started, about, default=Command(defaults, out=out))
     return _complete(command)
+
+
+def _is_given(value: Any) -> bool:
+    return value is not None and value is not False  # a seed of 0 equals False
 
 
 def from_python(options: Mapping[str, Any], out: Path | None, resume: bool) -> Command:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from cfp.config import Config, Particles, RunConfig
+from cfp.config import Particles, RunConfig
 from cfp.errors import ConfigError
 from dittogym import make_spec
 from dittogym.torch_env import find_resolution
@@ -56,8 +56,3 @@ class OptimisationConfig(GridConfig):
     """Particles of the simulations in training, at most the environment's; None: as many."""
     train_dt: float | None = None
     """Duration of a substep in training, s; None: as in the environment."""
-
-    def for_training(self: Config) -> Config:
-        """These options, with the environment in which actions are optimised."""
-        assert isinstance(self, OptimisationConfig)
-        return self.simulated_with(self.train_particles, self.train_dt)

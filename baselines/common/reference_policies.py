@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.grid import find_grid
 from baselines.common.open_loop import OpenLoop
 from cfp.config import RunConfig
 from cfp.evaluation.returns import UntrainedPolicy
@@ -16,14 +15,14 @@ from dittogym.action import ActionLayout, from_grid_layout
 
 
 def _scripted(config: RunConfig) -> OpenLoop:
-    size = find_grid("grid", config.task, "coarse")
-    return OpenLoop(wave(make_spec(config.task).horizon, size, config.action_layout))
+    spec = make_spec(config.task)
+    return OpenLoop(wave(spec.horizon, spec.coarse, config.action_layout))
 
 
 #: From the options of a run, in whose environment they act; they act on the task's coarse grid.
 REFERENCE_POLICIES: dict[str, Callable[[RunConfig], Policy]] = {
-    "zero": lambda config: UntrainedPolicy("zero", find_grid("grid", config.task, "coarse")),
-    "random": lambda config: UntrainedPolicy("random", find_grid("grid", config.task, "coarse")),
+    "zero": lambda config: UntrainedPolicy("zero", make_spec(config.task).coarse),
+    "random": lambda config: UntrainedPolicy("random", make_spec(config.task).coarse),
     "scripted": _scripted,
 }
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from baselines.compare.evaluation import Protocol
-from baselines.compare.plan import Run, make_runs, read_plan
+from baselines.compare.plan import PlannedRun, make_runs, read_plan
 from baselines.compare.processes import LocalExecutor, Outcome, RayExecutor, Resources, execute
 from baselines.compare.report import read_result, write_report
 from cfp.config import Preset
@@ -131,7 +131,7 @@ def compare(command: Command) -> int:
     chosen = [run for run in chosen if read_result(run, protocol).state != "finished"]
     outcomes: list[Outcome] = []
 
-    def on_outcome(run: Run, outcome: Outcome) -> None:
+    def on_outcome(run: PlannedRun, outcome: Outcome) -> None:
         outcomes.append(outcome)
         print(f"[{len(outcomes)}/{len(chosen)}] {run.name}: {outcome} {run.error}".rstrip(), flush=True)
 
@@ -149,7 +149,7 @@ def compare(command: Command) -> int:
     return code
 
 
-def _report(command: Command, runs: Sequence[Run], protocol: Protocol) -> int:
+def _report(command: Command, runs: Sequence[PlannedRun], protocol: Protocol) -> int:
     """Write the report; returns 0 if all runs are finished and evaluated, else 1."""
     results = [read_result(run, protocol) for run in runs]
     print(f"report: {write_report(command.out, results, command.algos[0], protocol)}")

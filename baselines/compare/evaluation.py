@@ -10,7 +10,7 @@ from typing import Any, Literal
 import baselines
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare import paper
-from baselines.compare.plan import Run, reference_config
+from baselines.compare.plan import PlannedRun, reference_config
 from baselines.registry import sees
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
@@ -38,7 +38,7 @@ def play_episodes(config: RunConfig, policy: Policy, layouts: Sequence[int], det
     return evaluate([trial], config.make_spec().horizon)[0].episodes
 
 
-def identity(run: Run) -> str:
+def identity(run: PlannedRun) -> str:
     """What tells the policy of a run from others: the hash of its file, or the name of a reference policy."""
     path = run.folder / "policy.safetensors"
     if run.reference:
@@ -46,14 +46,14 @@ def identity(run: Run) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 
-def requirements(run: Run, protocol: Protocol) -> dict[str, Any]:
+def requirements(run: PlannedRun, protocol: Protocol) -> dict[str, Any]:
     """What must be the same for an evaluation to count."""
     noise = not protocol.deterministic(run.task)
     own = {"episodes": protocol.episodes, "particles": protocol.particles, "noise": noise}
     return {"policy": identity(run), **own}
 
 
-def evaluate_run(run: Run, protocol: Protocol) -> None:
+def evaluate_run(run: PlannedRun, protocol: Protocol) -> None:
     """Evaluate the policy of a run and put the result into its record.
 
     The layouts are the same for the runs of all seeds: those on which no run of a comparison trains or chooses.
@@ -83,7 +83,7 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
     run.update_record(evaluation=requirements(run, protocol) | found)
 
 
-def read_evaluation(run: Run, protocol: Protocol) -> dict[str, Any] | None:
+def read_evaluation(run: PlannedRun, protocol: Protocol) -> dict[str, Any] | None:
     """The evaluation of a run under a protocol; None if there is none."""
     found: dict[str, Any] = run.record.get("evaluation", {})
     return found if requirements(run, protocol).items() <= found.items() else None

@@ -46,7 +46,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Run:
+class PlannedRun:
     """One element of a plan."""
 
     label: str  # the algorithm, or the variant of one that the plan names
@@ -159,7 +159,7 @@ def make_runs(
     preset: str = "quick",
     steps: int | None = None,
     device: str = "auto",
-) -> list[Run]:
+) -> list[PlannedRun]:
     """All runs of a plan, by seed, so that a comparison that is stopped early has something to compare.
 
     Args:
@@ -207,12 +207,12 @@ def make_runs(
                 raise ConfigError(f"{label} on {task}: {error}") from error
             found[task, label] = options
     runs = [
-        Run(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task_name(task)}-{preset}-{seed}")
+        PlannedRun(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task_name(task)}-{preset}-{seed}")
         for seed in seeds
         for (task, label), options in found.items()
         if seed == seeds[0] or options["algo"] not in REFERENCE_POLICIES
     ]
-    places: dict[Path, Run] = {}
+    places: dict[Path, PlannedRun] = {}
     for run in runs:  # as those of tasks of one name in two modules; the results of one would count for both
         if (other := places.setdefault(run.folder, run)) is not run:
             raise ConfigError(

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from baselines.compare.evaluation import Protocol
-from baselines.compare.plan import Run
+from baselines.compare.plan import PlannedRun
 from baselines.compare.worker import IN_USE
 from cfp.errors import ConfigError
 from cfp.files import write_text
@@ -34,7 +34,9 @@ class Resources:
     gpus: float = 0.0  # also a fraction of one; with Ray only
 
 
-def carry_out(run: Run, protocol: Protocol, resources: Resources, urgency: Callable[[], int] = lambda: 0) -> Outcome:
+def carry_out(
+    run: PlannedRun, protocol: Protocol, resources: Resources, urgency: Callable[[], int] = lambda: 0
+) -> Outcome:
     """Carry out a run in a process of its own, whose output goes to ``log.txt`` in the folder of the run.
 
     Args:
@@ -65,7 +67,7 @@ def carry_out(run: Run, protocol: Protocol, resources: Resources, urgency: Calla
     return "failed"
 
 
-def _call(words: list[str], run: Run, threads: int, urgency: Callable[[], int]) -> tuple[int, str]:
+def _call(words: list[str], run: PlannedRun, threads: int, urgency: Callable[[], int]) -> tuple[int, str]:
     """Exit code of a process, and the last line of its output.
 
     It is in a session of its own, so that Ctrl-C reaches the parent only.
@@ -100,7 +102,7 @@ class LocalExecutor:
         self.resources, self.urgency = resources, 0
         self._pool = ThreadPoolExecutor(workers)
 
-    def submit(self, run: Run, protocol: Protocol) -> Future[Outcome]:
+    def submit(self, run: PlannedRun, protocol: Protocol) -> Future[Outcome]:
         """Begin a run as soon as there is room for it."""
         return self._pool.submit(carry_out, run, protocol, self.resources, lambda: self.urgency)
 
@@ -134,7 +136,7 @@ class RayExecutor:
             scheduling_strategy="SPREAD",
         )
 
-    def submit(self, run: Run, protocol: Protocol) -> Future[Outcome]:
+    def submit(self, run: PlannedRun, protocol: Protocol) -> Future[Outcome]:
         """Begin a run as soon as there is room for it."""
         reference = self._task.remote(run, protocol, self._resources)
         self._references.append(reference)
@@ -152,10 +154,10 @@ class RayExecutor:
 
 
 def execute(
-    runs: Iterable[Run],
+    runs: Iterable[PlannedRun],
     protocol: Protocol,
     executor: LocalExecutor | RayExecutor,
-    on_outcome: Callable[[Run, Outcome], None],
+    on_outcome: Callable[[PlannedRun, Outcome], None],
 ) -> None:
     """Carry out runs, and tell ``on_outcome`` how each ended.
 
@@ -163,7 +165,7 @@ def execute(
     end; the second Ctrl-C stops them at once.
     """
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    futures: dict[Future[Outcome], Run] = {}
+    futures: dict[Future[Outcome], PlannedRun] = {}
     try:
         futures |= {executor.submit(run, protocol): run for run in runs}
         for future in as_completed(futures):
@@ -182,7 +184,7 @@ def execute(
         executor.shutdown()
 
 
-def _outcome(future: Future[Outcome], run: Run) -> Outcome:
+def _outcome(future: Future[Outcome], run: PlannedRun) -> Outcome:
     """How a run ended, also where Ray has lost it."""
     error = future.exception()
     if error is None:

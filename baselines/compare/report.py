@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from baselines.compare.evaluation import Protocol, read_evaluation
-from baselines.compare.plan import Run
+from baselines.compare.plan import PlannedRun
 from cfp.evaluation.page import STYLE, write_figure
 from cfp.evaluation.returns import PLAN, REPLAYED, t_interval
 from cfp.files import write_text
@@ -42,10 +42,10 @@ def align(curves: Sequence[Curve]) -> Curve:
 
 
 @dataclass(frozen=True)
-class Result:
+class RunResult:
     """What the folder of a run holds."""
 
-    run: Run
+    run: PlannedRun
     evaluation: dict[str, Any] | None  # None if it is not complete
     curve: Curve
 
@@ -65,15 +65,15 @@ class Result:
         return float(np.mean(self.evaluation["returns"]))
 
 
-def read_result(run: Run, protocol: Protocol) -> Result:
+def read_result(run: PlannedRun, protocol: Protocol) -> RunResult:
     """Read the folder of a run; of two evaluations at the same step, as at a handover, the later one counts."""
     rows = read_table(run.folder / "evaluations.csv", ("step", "mean"))
     values = sorted({float(row["step"]): float(row["mean"]) for row in rows}.items())
     steps, means = np.array(values).reshape(-1, 2).T
-    return Result(run, read_evaluation(run, protocol), (steps, means))
+    return RunResult(run, read_evaluation(run, protocol), (steps, means))
 
 
-def raw_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+def raw_rows(results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """A row for each episode of the evaluations."""
     rows = []
     for result in results:
@@ -85,15 +85,15 @@ def raw_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     return rows
 
 
-def grouped(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
+def grouped(results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
     """Evaluated runs by task and algorithm: tasks in their order, in each those that observe the same together."""
-    groups: dict[tuple[str, str], list[Result]] = {}
+    groups: dict[tuple[str, str], list[RunResult]] = {}
     for result in results:
         if result.evaluation is not None:
             groups.setdefault((result.run.task, result.run.label), []).append(result)
     tasks = list(dict.fromkeys(task for task, _ in groups))
 
-    def place(group: tuple[tuple[str, str], list[Result]]) -> tuple[int, int, float]:
+    def place(group: tuple[tuple[str, str], list[RunResult]]) -> tuple[int, int, float]:
         (task, _), members = group
         mean = float(np.mean([member.score for member in members]))
         return tasks.index(task), SEES.index(observes(members)), -mean
@@ -101,13 +101,13 @@ def grouped(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
     return dict(sorted(groups.items(), key=place))
 
 
-def observes(group: Sequence[Result]) -> str:
+def observes(group: Sequence[RunResult]) -> str:
     """What the policies of an algorithm observe."""
     assert group[0].evaluation is not None
     return str(group[0].evaluation["observes"])
 
 
-def scores_by_name(group: Sequence[Result]) -> dict[str, dict[int, float]]:
+def scores_by_name(group: Sequence[RunResult]) -> dict[str, dict[int, float]]:
     """Scores by seed under each name that an algorithm is shown by: a plan has two, see `REPLAYED`."""
     label, scores = group[0].run.label, {result.run.seed: result.score for result in group}
     evaluations = {result.run.seed: result.evaluation or {} for result in group}
@@ -115,7 +115,7 @@ def scores_by_name(group: Sequence[Result]) -> dict[str, dict[int, float]]:
     return {f"{label}: {PLAN}": plans, f"{label}: {REPLAYED}": scores} if plans else {label: scores}
 
 
-def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Table:
+def make_table(results: Sequence[RunResult], first: str, protocol: Protocol) -> Table:
     """The table: an algorithm on a task in each row, with its difference to the ``first`` algorithm."""
     rows, groups = [], grouped(results)
     for (task, label), group in groups.items():
@@ -164,10 +164,10 @@ def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Tab
         *columns(",d", steps="steps"),
         *columns(",.1f", minutes="minutes"),
     )
-    return Table("returns", "Returns", description, shown, rows)
+    return Table("Returns", description, shown, rows)
 
 
-def draw(results: Sequence[Result], columns: int = 2) -> Figure:
+def draw(results: Sequence[RunResult], columns: int = 2) -> Figure:
     """For each task: curves of the evaluations during training, and the returns of the evaluated policies.
 
     Args:
@@ -207,7 +207,7 @@ def draw(results: Sequence[Result], columns: int = 2) -> Figure:
     return figure
 
 
-def write_report(folder: Path, results: Sequence[Result], first: str, protocol: Protocol) -> Path:
+def write_report(folder: Path, results: Sequence[RunResult], first: str, protocol: Protocol) -> Path:
     """Write ``episodes.csv``, ``report.md``, ``index.html`` and its pictures; another process may do the same."""
     table, others = make_table(results, first, protocol), [each for each in results if each.state != "finished"]
     end = "; the others:" if others else "."

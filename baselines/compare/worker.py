@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from baselines import train
 from baselines.compare.evaluation import Protocol, evaluate_run
-from baselines.compare.plan import Run
+from baselines.compare.plan import PlannedRun
 
 #: Exit code if another process holds the run; a training never ends with it.
 IN_USE = 3
@@ -24,7 +24,7 @@ IN_USE = 3
 WAIT = 120.0
 
 
-def train_and_evaluate(run: Run, protocol: Protocol) -> int:
+def train_and_evaluate(run: PlannedRun, protocol: Protocol) -> int:
     """Do what is left of a run; returns an exit code, that of the training if it is not 0."""
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -55,7 +55,7 @@ def main() -> int:
     """Entry point of the process; returns its exit code."""
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     values = json.loads(sys.argv[1])
-    run = Run(**values["run"] | {"folder": Path(values["run"]["folder"])})
+    run = PlannedRun(**values["run"] | {"folder": Path(values["run"]["folder"])})
     return train_and_evaluate(run, Protocol(**values["protocol"]))
 
 

@@ -24,7 +24,7 @@ from baselines.registry import configure, find
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import check_norms, descend
 from cfp.analytic.window import Episodes
-from cfp.config import TASK_OPTIONS, Config, Particles, StagedConfig, check_training_seeds
+from cfp.config import TASK_OPTIONS, Particles, StagedConfig, check_training_seeds
 from cfp.envs.make import choose_device, make_env, make_torch_env, seeded
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError, check_at_least, check_fraction, check_positive
 from cfp.experiment.cli import StopSignals
@@ -97,11 +97,6 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Particle layouts that training episodes start from in turn; in GROW and OBSTACLE all are the same."""
     planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
-
-    def for_training(self: Config) -> Config:
-        """These options, with the environment that the student is taught in."""
-        assert isinstance(self, DistillConfig)
-        return self.simulated_with(self.train_particles)
 
     @property
     def planner_resolution(self) -> int:
@@ -285,7 +280,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         self.actor.fix_std()
         self.actor.to(self.device)
         self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
-        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.actor)
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=self.actor)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
 
@@ -385,12 +380,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """Act on an ``observation``, see stable-baselines3's ``predict``: without noise if ``deterministic``.
-
-        Actions are enlarged to the grid of the algorithm's environment; ``state`` is returned as it is, and
-        ``episode_start`` has no effect, as the policy has no memory.
-        """
-        actions, state = self.trained_policy.predict(observation, state, episode_start, deterministic)
+        """Act as `cfp.learner.UpdateLoop.predict` does, on the grid of the algorithm's environment."""
+        actions, state = super().predict(observation, state, episode_start, deterministic)
         patch = self.config.make_spec().patch
         return project(torch.from_numpy(actions), patch, patch).numpy(), state
 
@@ -407,7 +398,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
 
     @staticmethod
     def preset(task: str, name: str) -> DistillConfig:
-        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
+        """Defaults of a task: grids and gates of the same preset of ``cfp-sac``, but always the paper's networks.
 
         Both presets teach with lite particles; ``quick`` is evaluated there, ``paper`` in the paper's environment.
         SHAPE MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.analytic.window import Window, discount_rate, td_lambda_targets
 from cfp.config import WindowConfig
 from cfp.errors import NonFiniteError
+from cfp.learner import follow
 from cfp.resumable import Resumable
 from dittogym import TorchEnv
 from dittogym.copies import constant
@@ -171,5 +171,5 @@ class Critic(Resumable):
             loss.backward()
             norms.append(descend(self.adam, self.options.max_grad_norm))
         check_norms(norms, "critic")
-        get_ema_multi_avg_fn(1 - self.options.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
+        follow(self.target, self.network, 1 - self.options.tau)
         return float(loss.detach())

@@ -5,8 +5,9 @@ The policy sees the image only. The critic sees the state of the simulation, and
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from cfp.config import AnalyticConfig, of_stage
 from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import AveragedWeights, CoarseToFine, NetworksPolicy, UpdateLoop, linear_decay, refines
+from cfp.learner import CoarseToFine, NetworksPolicy, UpdateLoop, follow, linear_decay, refines
 from cfp.presets import analytic_preset
 from cfp.resumable import Resumable, compress, decompress
 
@@ -137,8 +138,8 @@ class Regression(Resumable):
     parts = ("actor", "average", "adam")
 
     def __init__(self, actor: Actor, learning_rate: float, decay: float, max_grad_norm: float) -> None:
-        self.actor, self.max_grad_norm = actor, max_grad_norm
-        self.average = AveragedWeights(actor, decay)
+        self.actor, self.decay, self.max_grad_norm = actor, decay, max_grad_norm
+        self.average = copy.deepcopy(actor).requires_grad_(False)
         self.adam = make_adam(actor.trainable_parameters(), learning_rate, REGRESSION_BETAS)
 
     def update(self, images: Tensor, locations: Tensor, learning_rate: float) -> tuple[Tensor, Tensor]:
@@ -152,7 +153,7 @@ class Regression(Resumable):
         loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)
         loss.backward()
         norm = descend(self.adam, self.max_grad_norm)
-        self.average.update_parameters(self.actor)
+        follow(self.average, self.actor, self.decay)
         return loss.detach(), norm
 
 
@@ -179,8 +180,9 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def _setup_model(self) -> None:
         config = self.config
+        self.spec = config.actor_spec(self.stage)
         with seeded(config.seed):
-            self.actor = build_actor(config.actor_spec(self.stage)).to(self.device)
+            self.actor = build_actor(self.spec).to(self.device)
         self.actor.fix_std()  # its parameters are not the optimiser's
         self.regression = Regression(self.actor, config.learning_rate, config.weight_average, config.max_grad_norm)
         self.features = StateFeatures(displacement=config.displacement)
@@ -188,7 +190,8 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
             critic = mlp(self.features.size(len(config.make_spec().bodies) - 1), 1).to(self.device)
         self.critic = Critic(critic, config)
         networks = {"learned": self.actor, "value": critic, "target": self.critic.target}
-        self.policy = NetworksPolicy(self.observation_space, self.action_space, self.trained_actor, **networks)
+        actor = self.trained_actor
+        self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=actor, **networks)
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
@@ -207,7 +210,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
 
     def observe(self) -> Tensor:
         """What the policy sees now, uint8 (B, 3, 64, 64)."""
-        return self.config.actor_spec(self.stage).filled(self.simulation.observation())
+        return self.spec.filled(self.simulation.observation())
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
@@ -319,12 +322,6 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         improved = self.action_step(actions, gradients, step_size)
         return torch.cat(images), improved, window
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
-        """Act on an ``observation`` by the actor with averaged weights, see `cfp.ActorPolicy.predict`."""
-        return self.trained_policy.predict(observation, state, episode_start, deterministic)
-
     def log_row(self) -> None:
         """Begin the mean return of the next row."""
         self.collector.episodes.recent_returns = []
@@ -336,7 +333,7 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     @property
     def trained_actor(self) -> Actor:
         """The actor with averaged weights."""
-        return cast(Actor, self.regression.average.module)
+        return self.regression.average
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "regression.adam", "critic.adam"], []

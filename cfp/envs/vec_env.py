@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -152,17 +152,12 @@ class TorchVecEnv(VecEnv):
     def close(self) -> None:
         """Do nothing: the environment holds no window and no file."""
 
-    def _indices(self, indices: VecEnvIndices) -> list[int]:
-        if indices is None:
-            return list(range(self.num_envs))
-        return list(indices) if isinstance(indices, Iterable) else [indices]
-
     def _owner(self, attr_name: str) -> Any:
         return self if attr_name == "render_mode" else self.torch_env
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Attribute of the batch, repeated for each requested element."""
-        return [getattr(self._owner(attr_name), attr_name) for _ in self._indices(indices)]
+        return [getattr(self._owner(attr_name), attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the whole batch.
@@ -170,7 +165,7 @@ class TorchVecEnv(VecEnv):
         Raises:
             ValueError: Only some elements are requested.
         """
-        if self._indices(indices) != list(range(self.num_envs)):
+        if list(self._get_indices(indices)) != list(range(self.num_envs)):
             raise ValueError(f"indices must be None, got {indices}: the elements of a batch share their attributes")
         setattr(self._owner(attr_name), attr_name, value)
 
@@ -179,11 +174,11 @@ class TorchVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the batch once and repeat its result for each requested element."""
         result = getattr(self.torch_env, method_name)(*method_args, **method_kwargs)
-        return [result for _ in self._indices(indices)]
+        return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Always False, for any ``wrapper_class``: elements are not wrapped one by one."""
-        return [False for _ in self._indices(indices)]
+        return [False for _ in self._get_indices(indices)]
 
 
 def _split(info: dict[str, np.ndarray]) -> list[dict[str, Any]]:

@@ -171,7 +171,7 @@ def write_page(folder: Path, config: RunConfig, results: Sequence[Result], note:
         f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
         film if (folder / "video.mp4").exists() else "",
         replay if (folder / "replay.html").exists() else "",
-        Table("results", "Final evaluation", note, RESULTS, to_rows(results)).to_html(),
+        Table("Final evaluation", note, RESULTS, to_rows(results)).to_html(),
         '<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps">',
         f"<h2>Options</h2><p>Preset {config.preset}, seed {config.seed}, torchmpm {torchmpm.__version__}. This command "
         "repeats the training:</p>",

@@ -307,7 +307,7 @@ def _mean(values: Iterable[float]) -> float:
 
 def evaluate(
     trials: Sequence[Trial],
-    steps: int | None = None,
+    steps: int,
     should_stop: Callable[[], bool] = lambda: False,
     name: str = "evaluation",
 ) -> list[Result]:
@@ -317,7 +317,7 @@ def evaluate(
 
     Args:
         trials: Episodes, all played side by side.
-        steps: Steps of an episode at most, to show a progress bar; None shows none.
+        steps: Steps of an episode at most, for the progress bar.
         should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
         name: What the progress bar is called.
     """
@@ -325,9 +325,9 @@ def evaluate(
     threads, stop = torch.get_num_threads(), Event()
     # On a GPU one at a time: nobody may draw random numbers while an environment records its operations.
     workers = 1 if any(trial.together for trial in trials) else min(threads, len(spans))
-    total = (steps or 0) * sum(trial.episodes for trial in trials)
+    total = steps * sum(trial.episodes for trial in trials)
     # Beside the bar of a training (leave=None) it vanishes at the end.
-    bar = progress_bar(total=total, desc=name, leave=None, **({} if total else {"disable": True}))
+    bar = progress_bar(total=total, desc=name, leave=None)
 
     def play_span(trial: Trial, first: int, count: int) -> list[Played]:
         taken = 0
@@ -341,7 +341,7 @@ def evaluate(
 
         torch.set_num_threads(1)
         episodes = trial.play(first, count, before_step)
-        bar.update((steps or 0) * count - taken)
+        bar.update(steps * count - taken)
         return episodes
 
     with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:

@@ -55,7 +55,7 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
     """
     films = (".mp4", ".gif", ".webp", ".png")
     for name, path in paths.items():
-        allowed = {"replay": (".html",), "video": films}.get(name, (".html", *films))
+        allowed = (".html",) if name == "replay" else films
         if path is not None and path.suffix not in allowed:
             raise ConfigError(f"{name} must end in {' or '.join(allowed)}, got {path}")
     for name in options:

@@ -25,7 +25,7 @@ from cfp.learner import Learner
 from cfp.sac.replay import FIELDS
 from dittogym.trajectories import ZIP_ERRORS
 
-VERSION = 3
+VERSION = 4
 #: What torch raises for damaged files, besides ``pickle.UnpicklingError``.
 UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
 

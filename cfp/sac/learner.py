@@ -7,11 +7,12 @@ clipped separately, the gate is penalised, and the random phase is independent o
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 import torch
@@ -26,7 +27,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor, NetworkInput, upsample
 from cfp.agent.pixels import fill_missing
@@ -35,7 +35,7 @@ from cfp.envs.make import choose_device, make_env
 from cfp.envs.vec_env import TorchVecEnv, keeps_tensors
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation.page import policy_pictures
-from cfp.learner import AveragedWeights, CoarseToFine, Learner, refines
+from cfp.learner import CoarseToFine, Learner, follow, refines
 from cfp.presets import sac_preset
 from cfp.resumable import generator_state, restore_generator
 from cfp.sac.policies import CFPPolicy, TwinCritic, TwinCriticPolicy
@@ -289,13 +289,13 @@ class CFP(SAC):
     def restart_average(self) -> None:
         """Let the average of the actor's weights begin with those it has now."""
         decay, actor = self.hyperparameters.weight_average, self.networks()[0]
-        self.average = AveragedWeights(actor, decay) if decay else None
+        self.average = copy.deepcopy(actor).requires_grad_(False) if decay else None
 
     @property
     def trained_actor(self) -> Actor:
         """The actor with averaged weights, or the one in training if there is no average."""
         self.read_updates()  # so that weights that are not finite are not saved
-        return self.networks()[0] if self.average is None else cast(Actor, self.average.module)
+        return self.networks()[0] if self.average is None else self.average
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics."""
@@ -371,8 +371,8 @@ class CFP(SAC):
             critic.requires_grad_(True)
             scalars |= of_actor | {"actor_loss": loss.detach()}
         if self.average is not None:
-            self.average.update_parameters(actor)
-        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
+            follow(self.average, actor, self.hyperparameters.weight_average)
+        follow(target, critic, 1 - self.tau)
         return scalars | self.reward_statistics.scalars()
 
     def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
@@ -496,7 +496,7 @@ class CFP(SAC):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()
-        return [*modules, "reward_statistics", *(["average"] if self.average else [])], tensors
+        return [*modules, "reward_statistics", *([] if self.average is None else ["average"])], tensors
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "reward_statistics", "noise", "average", "_unread", "_are_finite"]
@@ -639,8 +639,10 @@ class CFPSAC(SACLearner, CoarseToFine):
         tensors = choose_device(config.device) != "cpu"
         size, conditions = config.action_size(stage), config.conditions(stage)
         env = make_env(config, size, None, config.max_episode_steps, tensors, conditions=conditions)
-        learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": config.actor_spec(stage)})
+        spec = config.actor_spec(stage)
+        learner = cls.make(config, stage, folder, env, CFPPolicy, {"spec": spec})
         assert isinstance(learner, CFPSAC)
+        learner.spec = spec
         learner.starts_trained = cls.warm_start(config, stage, folder, learner.networks()[0])
         learner.restart_average()
         learner.trains_encoder = not refines(config, folder, stage)

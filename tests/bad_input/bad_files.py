@@ -286,10 +286,10 @@ RUNS = [
     resumed("a checkpoint cut short", cut("checkpoint/state.pt"), "state.pt: the checkpoint is damaged"),
     resumed(
         "a checkpoint that runs code",
-        lambda folder: torch.save({"version": 3, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
+        lambda folder: torch.save({"version": 4, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
         "state.pt: the checkpoint is damaged (UnpicklingError)",
     ),
-    resumed("a checkpoint of version 99", state(version=99), "checkpoint version must be 3, got 99"),
+    resumed("a checkpoint of version 99", state(version=99), "checkpoint version must be 4, got 99"),
     resumed("a checkpoint without a model", state(learner=None), "does not fit this program", "learner"),
     resumed("a checkpoint before its time", state(offset=-5), "does not fit this program", "negative"),
     resumed("a checkpoint of stage 8", state(stage=8), "does not fit this program", "it is of stage 8"),

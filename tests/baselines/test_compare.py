@@ -18,7 +18,7 @@ from filelock import FileLock
 from baselines.compare import paper, processes, worker
 from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
-from baselines.compare.plan import Run, make_runs, read_plan, to_words
+from baselines.compare.plan import PlannedRun, make_runs, read_plan, to_words
 from baselines.compare.processes import LocalExecutor, Resources, carry_out
 from baselines.compare.report import align, make_table, paired_differences, read_result, write_report
 from cfp.errors import ConfigError
@@ -109,7 +109,7 @@ def test_every_policy_plays_the_same_episodes_and_all_are_reported(finished):
 def test_evaluation_is_that_of_the_policy_alone(finished):
     """Each episode can be asked for by itself and is the same to the last bit."""
     options = json.loads((finished / "runs" / NAMES[1] / "comparison.json").read_text())["options"]
-    run = Run("shac-wide", "shapematch", 0, options, finished / "runs" / NAMES[1])
+    run = PlannedRun("shac-wide", "shapematch", 0, options, finished / "runs" / NAMES[1])
     found = run.record["evaluation"]
     run.update_record(evaluation={})
     for episodes in (1, 2):
@@ -200,7 +200,7 @@ PATIENT = "import os, sys; open('ready', 'w').close(); os.read(0, 1); open('ende
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return Run("zero", "run", 0, {"algo": "zero"}, tmp_path / "run")
+    return PlannedRun("zero", "run", 0, {"algo": "zero"}, tmp_path / "run")
 
 
 @pytest.fixture
@@ -253,7 +253,7 @@ def test_a_folder_in_use_is_left_alone(finished, monkeypatch):
     options = json.loads((folder / "comparison.json").read_text())["options"]
     before = (folder / "comparison.json").read_bytes()
     with FileLock(folder / ".comparison.lock"):
-        code = worker.train_and_evaluate(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100))
+        code = worker.train_and_evaluate(PlannedRun("zero", "shapematch", 0, options, folder), Protocol(9, 100))
     assert code == worker.IN_USE and (folder / "comparison.json").read_bytes() == before
 
 
@@ -324,7 +324,7 @@ def test_plans_of_the_documentation_hold(path):
 
 def test_a_folder_that_is_no_comparison_s_is_refused(tmp_path):
     (run,) = runs_of({}, "zero")
-    run = Run("zero", "run", 0, run.options, tmp_path)
+    run = PlannedRun("zero", "run", 0, run.options, tmp_path)
     write_text(tmp_path / "config.json", "{}")
     with pytest.raises(ConfigError, match="no comparison has begun"):
         run.check_folder()
@@ -352,7 +352,7 @@ def test_curves_are_aligned_where_all_have_values():
 
 def written(folder, label, seed, returns, observes="image", curve=None, plan=None):
     """A run as it lies in its folder."""
-    run = Run(label, "run", seed, {"algo": label, "device": "cpu"}, folder / f"{label}-{seed}")
+    run = PlannedRun(label, "run", seed, {"algo": label, "device": "cpu"}, folder / f"{label}-{seed}")
     layouts, successes = list(range(20000, 20000 + len(returns))), [value > 5 for value in returns]
     evaluation = {
         "policy": label if label == "zero" else "",
@@ -377,7 +377,7 @@ def test_table_against_values_worked_out_by_hand(tmp_path):
         written(tmp_path, "shac", 0, [4.0, 6.0], "state", {500: 1, 1000: 2}),
         written(tmp_path, "shac", 1, [7.0, 7.0], "state", {500: 1, 1000: 2}),
         written(tmp_path, "coarse", 0, [8.0, 8.0], curve={500: 1}),
-        Run("coarse", "run", 1, {"algo": "coarse"}, tmp_path / "coarse-1"),
+        PlannedRun("coarse", "run", 1, {"algo": "coarse"}, tmp_path / "coarse-1"),
     ]
     write_text(runs[-1].folder / "error.txt", "NonFiniteError: a loss | is not finite\n")
     results = [read_result(run, Protocol(2)) for run in runs]

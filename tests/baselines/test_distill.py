@@ -118,6 +118,15 @@ def test_student_learns_from_images_as_its_policy_will_see_them():
     assert student.spec.fill_missing and not torch.equal(student.spec.filled(seen), seen)
 
 
+def test_algorithm_acts_by_the_student_on_the_grid_of_its_environment():
+    student = make()
+    images = student.simulation.observation().numpy()
+    action, size = student.predict(images, deterministic=True)[0], student.spec.action_size
+    wanted = torch.from_numpy(student.trained_policy.predict(images, deterministic=True)[0])
+    assert action.shape[2:] == student.action_space.shape[1:] != (size, size)
+    assert torch.equal(torch.from_numpy(action), project(wanted, 64, student.simulation.spec.patch))
+
+
 def test_student_does_as_the_teacher_in_a_closed_loop():
     own = {"num_envs": 4, "substeps": 20, "rollout_steps": 16, "updates": 20, "batch_size": 16}
     own |= {"steps": 384, "handover": (2 / 3,)}

@@ -171,7 +171,7 @@ def test_ranks_are_by_mean_return_within_what_is_observed():
     ranks = [(row["rank"], row["policy"]) for row in run.rows]
     ranked = [(1, "best"), (2, "good"), (2, "as good"), (4, "bad"), (1, "planner"), (1, "open loop")]
     assert ranks == [*ranked, ("reference", "zero")]
-    assert (run.name, kick.name) == ("run", "kick") and [row["rank"] for row in kick.rows] == ["reference"]
+    assert (run.title, kick.title) == ("run", "kick") and [row["rank"] for row in kick.rows] == ["reference"]
 
 
 def test_committed_results_are_those_of_the_package():

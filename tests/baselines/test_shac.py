@@ -156,8 +156,18 @@ def test_policy_goes_through_its_file(tmp_path):
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in policies]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     trials = [make_trial(learner.config, "", each, 2, deterministic=False, seed=3) for each in policies]
-    results = evaluate(trials)
+    results = evaluate(trials, 30)
     assert results[0] == results[1]
+
+
+def test_algorithm_acts_on_the_state_of_its_own_simulation(tmp_path):
+    learner = make("shapematch", grid=8, num_envs=2)
+    images = learner.simulation.observation().numpy()
+    wanted = learner.trained_policy.attached(learner.simulation).predict(images, deterministic=True)[0]
+    assert np.array_equal(learner.predict(images, deterministic=True)[0], wanted)
+    learner.save(tmp_path / "model.zip")
+    with pytest.raises(RuntimeError, match=r"call attached\(env\) first"):
+        Shac.load(tmp_path / "model.zip").predict(images)
 
 
 @pytest.mark.parametrize("left_out", ["deformation", "clock"])

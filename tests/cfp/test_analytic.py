@@ -155,11 +155,11 @@ def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation():
     assert any(name.startswith("coarse") for name in frozen)
     regression = Regression(actor, 3e-3, 0.9, 1.0)
     losses, average = [], parameters(actor)
-    for update in range(150):
+    for _ in range(150):
         losses.append(regression.update(images, targets, 3e-3)[0].item())
-        average = parameters(actor) if update == 0 else 0.9 * average + 0.1 * parameters(actor)
+        average = 0.9 * average + 0.1 * parameters(actor)
     assert losses[-1] < 0.3 * losses[0]
-    torch.testing.assert_close(parameters(regression.average.module), average, rtol=0, atol=1e-5)
+    torch.testing.assert_close(parameters(regression.average), average, rtol=0, atol=1e-5)
     assert not torch.equal(average, parameters(actor))
     assert all(torch.equal(value, dict(actor.named_parameters())[name]) for name, value in frozen.items())
 

@@ -15,6 +15,7 @@ import torch
 
 import baselines.train
 from cfp import registry, train
+from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.experiment.cli import Stopped, program_name, run_command
 from cfp.presets import sac_preset
@@ -33,6 +34,18 @@ def test_command_line_beats_file_beats_preset(tmp_path):
     assert parse(["--task", "run"]).out == Path("runs/cfp-analytic-run-quick-0")
     assert parse("--task run --learner sac --seed 4".split()).out == Path("runs/cfp-sac-run-quick-4")
     assert parse("--preset paper --task dig".split()).run == sac_preset("dig", "paper")
+
+
+def test_a_seed_of_zero_names_the_folder_to_resume_where_the_preset_has_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = "--task catch --preset paper --algo cfp-sac".split()
+    other = parse(words)
+    assert other.run.seed == 2
+    other.out.mkdir(parents=True)
+    (other.out / "config.json").write_text(json.dumps(to_json(other.run)))
+    command = parse([*words, "--seed", "0", "--resume"])
+    assert (command.run.seed, command.out) == (0, Path("runs/cfp-sac-catch-paper-0"))
+    assert parse([*words, "--resume"]).out == other.out
 
 
 def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeypatch):

@@ -33,6 +33,7 @@ from cfp.tables import read_table
 SPEC = ActorSpec((4, 8), (-1.0,), patch=16, encoder="small")
 OPTIONS = {"buffer_size": 60, "batch_size": 8, "update_start": 6, "random_steps": 10, "n_steps": 3, "gamma": 0.9}
 FIELDS = replay.FIELDS
+DEVICES = (["--device", "cpu"], [], ["--device", "cuda"])
 
 
 def make_model(tensors=True, env=None, cls=CFP, **options):
@@ -170,6 +171,14 @@ def test_a_gpu_has_as_many_batched_steps_of_more_robots(make, task):
     if make is sac_preset:
         assert for_gpu(config, 24_000_000_000).buffer_size == 320_000
         assert for_gpu(sac_preset(task, "paper")) == sac_preset(task, "paper")
+
+
+@pytest.mark.parametrize("learner", ["sac", "analytic"])
+def test_a_gpu_that_is_not_named_trains_with_the_options_of_a_cpu(learner, monkeypatch):
+    monkeypatch.setattr(registry, "gpu_memory", lambda device: 0 if device == "cpu" else 24_000_000_000)
+    usual, found, named = (train.parse(["--task", "run", "--learner", learner, *device]).run for device in DEVICES)
+    assert found == replace(usual, device="auto")
+    assert named.num_envs == 1_024 > usual.num_envs
 
 
 @pytest.mark.parametrize("learner", ["sac", "analytic"])

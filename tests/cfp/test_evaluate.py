@@ -71,15 +71,15 @@ def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(sho
     state = torch.get_rng_state()
     try:
         torch.set_num_threads(1)
-        alone = evaluate([trial])[0]
+        alone = evaluate([trial], 8)[0]
         torch.set_num_threads(threads)
-        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 3, **options), trial])
+        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 3, **options), trial], 8)
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
     assert together == alone and len(set(alone.returns)) == 4
     first, third = (make_trial(config, "", LinearPolicy(), 1, **options | {"seed": seed}) for seed in (5, 7))
-    assert [result.episodes[0] for result in evaluate([first, third])] == [alone.episodes[0], alone.episodes[2]]
+    assert [result.episodes[0] for result in evaluate([first, third], 8)] == [alone.episodes[0], alone.episodes[2]]
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -94,9 +94,9 @@ def test_trials_on_a_gpu_are_played_one_at_a_time(monkeypatch):
             return super().predict(*arguments, **options)
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    evaluate([fake_trial(Recorder(), 1, together=True) for _ in range(3)])
+    evaluate([fake_trial(Recorder(), 1, together=True) for _ in range(3)], 4)
     assert len(used) == 1
-    evaluate([fake_trial(Recorder(), 1) for _ in range(3)])
+    evaluate([fake_trial(Recorder(), 1) for _ in range(3)], 4)
     assert len(used) > 2
 
 
@@ -108,7 +108,7 @@ def test_noise_differs_between_layouts_and_steps():
             drawn.append(torch.randn(3))
             return super().predict(*arguments, **options)
 
-    evaluate([fake_trial(Recorder(), 3)])
+    evaluate([fake_trial(Recorder(), 3)], 4)
     assert len(drawn) == 12 and len(torch.stack(drawn).unique(dim=0)) == 12
 
 
@@ -116,7 +116,7 @@ def test_noise_differs_between_layouts_and_steps():
 def test_returns_are_in_the_order_of_layouts(together):
     # The later three are too high and end at once, which costs no steps where each has an environment of its own.
     policy = Counting()
-    result = evaluate([fake_trial(policy, 6, together, end_above=0.25)])[0]
+    result = evaluate([fake_trial(policy, 6, together, end_above=0.25)], 4)[0]
     assert result.returns == pytest.approx([2.0, 2.4, 2.8, 0.8, 0.9, 1.0])
     # The highest one succeeds; like the one below it, it has been torn.
     assert result.success == pytest.approx(1 / 6) and result.success_whole == 0.0
@@ -130,7 +130,7 @@ def test_returns_are_in_the_order_of_layouts(together):
 @pytest.mark.parametrize("seconds", [0.0, 100.0])
 def test_progress_of_a_long_evaluation_is_shown_where_there_is_no_terminal(seconds, monkeypatch, capsys):
     monkeypatch.setattr(messages, "SELDOM", seconds)
-    evaluate([fake_trial(Counting(), 2)], steps=4)
+    evaluate([fake_trial(Counting(), 2)], 4)
     shown = capsys.readouterr().err
     assert "evaluation: 100%" in shown and "8/8" in shown if not seconds else shown == ""
 
@@ -140,8 +140,9 @@ def test_an_episode_that_fails_ends_the_others():
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
+        trials = [fake_trial(policy, 1, horizon=10**6 if k == 0 else 10) for k, policy in enumerate(policies)]
         with pytest.raises(RuntimeError, match="had enough"):
-            evaluate([fake_trial(policy, 1, horizon=10**6 if k == 0 else 10) for k, policy in enumerate(policies)])
+            evaluate(trials, 10**6)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
@@ -150,7 +151,7 @@ def test_an_episode_that_fails_ends_the_others():
 
 def test_a_reward_that_is_not_finite_ends_an_evaluation():
     with pytest.raises(NonFiniteError, match="the reward function of the task returned NaN"):
-        evaluate([fake_trial(Counting(), 2, faults={3: "reward"})])
+        evaluate([fake_trial(Counting(), 2, faults={3: "reward"})], 4)
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():

@@ -400,10 +400,10 @@ def test_encoder_of_a_refined_policy_stays():
 def test_average_of_weights_is_the_policy():
     model = make_model(SMALL["plain"], FakeEnv(num_envs=2, resolution=8), weight_average=0.9)
     expected = {name: value.clone() for name, value in model.networks()[0].state_dict().items()}
-    for update in range(3):
+    for _ in range(3):
         model.update(make_batch(8))
         for name, value in model.networks()[0].state_dict().items():
-            expected[name] = value.clone() if update == 0 else 0.9 * expected[name] + 0.1 * value
+            expected[name] = 0.9 * expected[name] + 0.1 * value
     averaged = model.trained_actor.state_dict()
     assert all(torch.allclose(averaged[name], value, atol=1e-7) for name, value in expected.items())
     assert not torch.equal(averaged["mean.0.weight"], model.networks()[0].state_dict()["mean.0.weight"])

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import cfp
 from cfp import CFP, CFPAnalytic, Hyperparameters, ImageFeatures
@@ -114,6 +115,43 @@ def test_saved_model_acts_the_same_and_learns_on(algorithm, with_env, tmp_path):
         again.set_env(make_env())
     again.learn(16, reset_num_timesteps=False)
     assert again.num_timesteps == 32
+
+
+@pytest.mark.parametrize("algorithm", [CFP, CFPAnalytic])
+def test_average_of_a_loaded_model_goes_on_from_the_weights_that_it_had(algorithm, tmp_path):
+    model = make(algorithm)
+    model.learn(16)
+    model.save(tmp_path / "model.zip")
+    models = model, algorithm.load(tmp_path / "model.zip", make_env(), device="cpu")
+    images = torch.randint(0, 256, (4, 3, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    for each in models:
+        if algorithm is CFP:
+            torch.manual_seed(0)
+            transitions = torch.zeros(4, 128), images, torch.zeros(4, 1), torch.arange(4.0)[:, None]
+            each.update(ReplayBufferSamples(images, *transitions))
+        else:
+            each.regression.update(images, torch.zeros(4, 2, 8, 8), 1e-3)
+    averages = [each.trained_actor.state_dict() for each in models]
+    assert all(torch.equal(averages[1][name], value) for name, value in averages[0].items())
+
+
+def test_predict_acts_by_the_networks_in_training_and_leaves_them_as_they_are():
+    model = make(CFPAnalytic)
+    images = np.random.default_rng(0).integers(0, 256, (2, 3, 64, 64), dtype=np.uint8)
+    kept, trained = model.trained_policy, len(model.actor.trainable_parameters())
+    before = model.predict(images, deterministic=True)[0]
+    assert np.array_equal(kept.predict(images, deterministic=True)[0], before)
+    model.learn(16)
+    after = model.predict(images, deterministic=True)[0]
+    assert not np.array_equal(after, before) and np.array_equal(model.predict(images, deterministic=True)[0], after)
+    assert np.array_equal(kept.predict(images, deterministic=True)[0], before)
+    assert len(model.actor.trainable_parameters()) == trained > 0
+
+
+def test_networks_refuse_to_act_on_what_predict_has_not_prepared():
+    """Images with missing pixels, for instance."""
+    with pytest.raises(NotImplementedError, match="call predict of the algorithm"):
+        make(CFPAnalytic).policy.predict(np.zeros((3, 64, 64), np.uint8))
 
 
 @pytest.mark.parametrize(("taken", "over"), [((32,), 64), ((32, 64), 96)])

@@ -70,7 +70,7 @@ def test_policies_are_chosen_under_the_conditions_of_their_training(learner, tmp
 
     def returns(seed, conditions):
         own = {"deterministic": config.eval_deterministic, "seed": seed, "conditions": conditions}
-        return evaluate([make_trial(config, "", policy, 2, **own)])[0]
+        return evaluate([make_trial(config, "", policy, 2, **own)], config.make_spec().horizon)[0]
 
     chosen, (seed, _) = read_table(tmp_path / "evaluations.csv"), config.evaluation(1)
     varied, plain = (returns(seed, conditions) for conditions in (config.conditions(1), None))
