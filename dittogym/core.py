@@ -256,10 +256,11 @@ class Moment(NamedTuple):
 
 def simulate(model: Model, state: EnvState, action: Tensor) -> Moment:
     """Advance the physics by one control step and look at the result; arguments as in :func:`advance`."""
-    return _look(model, *advance(model, state, action))
+    return look(model, *advance(model, state, action))
 
 
-def _look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
+def look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
+    """What :func:`judge` needs of a state that :func:`advance` led to with an actuation (B, 2, P, P)."""
     now = features_of(state.particles, model.num_robot_particles)
     cost = action_cost(actuation) if model.spec.weights.get("action") else None
     return Moment(state, actuation, observe(model, state), now, info_of(model, state, now), cost)
@@ -318,18 +319,6 @@ def observe(model: Model, state: EnvState) -> Tensor:
 def soft_observation(model: Model, state: EnvState) -> Tensor:
     """The image as a smooth function of the state, see :meth:`dittogym.observation.Camera.observe_smoothly`."""
     return model.camera.observe_smoothly(state.particles.x, state.particles.v, state.origin, state.centre)
-
-
-def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = False) -> StepResult:
-    """Observation, reward, termination and success of a state that :func:`advance` led to; see :func:`judge`.
-
-    Args:
-        model: The task.
-        state: After the step.
-        actuation: (B, 2, P, P) on the patch, Pa.
-        soft: As in :func:`step`.
-    """
-    return judge(model, _look(model, state, actuation), soft=soft)
 
 
 def judge(model: Model, moment: Moment, *, soft: bool = False) -> StepResult:
