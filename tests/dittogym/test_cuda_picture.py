@@ -20,13 +20,12 @@ from torch import Tensor
 import dittogym
 from dittogym import cuda_picture
 from dittogym.observation import cuda_drawing
-from torchmpm.backends import compiler_found
 from torchmpm.native.cuda import compiler
 from torchmpm.native.cuda.compiler import FOLDERS
 from torchmpm.native.cuda.driver import Launch
-from torchmpm.native.library import build
+from torchmpm.native.library import build, find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 HERE = Path(__file__).resolve().parent
 IMITATION = HERE.parent / "torchmpm" / "imitation"
 CPU = torch.device("cpu")

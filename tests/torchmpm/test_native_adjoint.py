@@ -10,10 +10,10 @@ from scenes import Leaves, assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
-from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 COUNT = 120
 STATE = ("x", "v", "C", "F", "Jp")
