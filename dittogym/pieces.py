@@ -33,11 +33,6 @@ def largest_piece(x: Tensor, origin: Tensor) -> np.ndarray:
     for i, j in np.ndindex(2, 2):
         blocks[:, i : i + NODES + 1, j : j + NODES + 1] |= corners
     labels, pieces = ndimage.label(blocks, _NEIGHBOURS)
-    piece = labels[robot, column, row]
-    owner = np.zeros(pieces + 1, np.intp)
-    owner[piece] = robot
-    sizes = np.bincount(piece, minlength=pieces + 1)
-    sizes[0] = 0  # what is in no block
-    largest = np.zeros(len(x), np.intp)
-    np.maximum.at(largest, owner, sizes)
-    return largest / x.shape[1]
+    sizes = np.zeros((len(x), pieces + 1), np.intp)
+    np.add.at(sizes, (robot, labels[robot, column, row]), 1)
+    return sizes[:, 1:].max(1, initial=0) / x.shape[1]  # column 0: what is in no block
