@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchmpm
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 RULES = (
     torchmpm.VelocityRule("-y", j=(None, 19), friction=math.inf),
@@ -22,7 +22,7 @@ CENTRE, RADIUS = (0.09, 0.25), 0.09
 SIZES = {"1x22000": (1, 22_000), "1x2000": (1, 2_000), "16x2000": (16, 2_000), "64x2000": (64, 2_000)}
 #: Measured on a GPU only.
 LARGE = {"1024x2000": (1024, 2_000)}
-needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+needs_compiler = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 
 def cases(**sizes: str) -> pytest.MarkDecorator:

@@ -255,10 +255,14 @@ def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:
         raise ValueError(f"conditions must have a grid of at most {resolution}, as actions have, got {conditions.grid}")
     if not (conditions.shift or conditions.turn):
         return
-    turns, shifts = np.linspace(-conditions.turn, conditions.turn, 9), (-conditions.shift, conditions.shift)
-    numbers = torch.from_numpy(np.array(list(itertools.product(np.radians(turns), shifts, shifts))))
-    points = torch.from_numpy(probe(spec.robot)).expand(len(numbers), -1, -1)
-    for moved in start({"turn": numbers[:, 0], "shift": numbers[:, 1:]}, points, points.shape[1]).numpy():
+    # Steps of at most half the robot's width, so that it skips nothing that is in the way.
+    steps = math.ceil(2.0 * conditions.shift / min(spec.robot.shape.size))
+    turns = np.radians(np.linspace(-conditions.turn, conditions.turn, 9 if conditions.turn else 1))
+    shifts = np.linspace(-conditions.shift, conditions.shift, 2 * steps + 1)
+    points = torch.from_numpy(probe(spec.robot))[None]
+    for turn, *shift in itertools.product(turns, shifts, shifts):
+        numbers = {"turn": points.new_tensor([turn]), "shift": points.new_tensor([shift])}
+        moved = start(numbers, points, points.shape[1])[0].numpy()
         try:
             check_robot_at(spec, moved, moved.min(0), moved.max(0))
         except ValueError as error:

@@ -256,10 +256,11 @@ class Moment(NamedTuple):
 
 def simulate(model: Model, state: EnvState, action: Tensor) -> Moment:
     """Advance the physics by one control step and look at the result; arguments as in :func:`advance`."""
-    return _look(model, *advance(model, state, action))
+    return look(model, *advance(model, state, action))
 
 
-def _look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
+def look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
+    """What :func:`judge` needs of a state that :func:`advance` led to with an actuation (B, 2, P, P)."""
     now = features_of(state.particles, model.num_robot_particles)
     cost = action_cost(actuation) if model.spec.weights.get("action") else None
     return Moment(state, actuation, observe(model, state), now, info_of(model, state, now), cost)
@@ -268,8 +269,8 @@ def _look(model: Model, state: EnvState, actuation: Tensor) -> Moment:
 def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
     """Advance the physics by one control step.
 
-    Elements that are not finite afterwards pass no gradient to what they came from. Gradients of constants that all
-    elements share, such as a learned material of the task, are not finite then.
+    Elements that are not valid afterwards, see :func:`is_valid`, pass no gradient to what they came from. Gradients of
+    constants that all elements share, such as a learned material of the task, need not be finite then.
 
     Args:
         model: The task.
@@ -280,10 +281,10 @@ def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Te
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
     """
     spec = model.spec
-    finite: list[Tensor] = []  # where gradients may go back, known after the step
+    valid: list[Tensor] = []  # where gradients may go back, known after the step
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:
-        guard = functools.partial(_stop_gradients, finite=finite)
+        guard = functools.partial(_stop_gradients, valid=valid)
         state, action = tree.map(guard, tree.without_inference((state, action)))
     physics = state.physics
     solver = model.solver_for(physics)
@@ -293,19 +294,20 @@ def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Te
     particles = solver.step(
         state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
     )
-    if guarded:
-        finite.append(particles.is_finite())
     com = particles.x[:, : model.num_robot_particles].mean(1)
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
-    return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), actuation
+    after = replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1)
+    if guarded:
+        valid.append(is_valid(model, after))
+    return after, actuation
 
 
-def _stop_gradients(value: Tensor, finite: list[Tensor]) -> Tensor:
-    """Let no gradient of an element that is not finite pass: NaN would spread through parameters the batch shares."""
+def _stop_gradients(value: Tensor, valid: list[Tensor]) -> Tensor:
+    """Let no gradient of an element that is not valid pass: NaN would spread through parameters the batch shares."""
     if value.requires_grad:
         value = value.view_as(value)
-        value.register_hook(lambda g: None if g is None else tree.where(finite[0], g, torch.zeros_like(g)))
+        value.register_hook(lambda g: None if g is None else tree.where(valid[0], g, torch.zeros_like(g)))
     return value
 
 
@@ -317,18 +319,6 @@ def observe(model: Model, state: EnvState) -> Tensor:
 def soft_observation(model: Model, state: EnvState) -> Tensor:
     """The image as a smooth function of the state, see :meth:`dittogym.observation.Camera.observe_smoothly`."""
     return model.camera.observe_smoothly(state.particles.x, state.particles.v, state.origin, state.centre)
-
-
-def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = False) -> StepResult:
-    """Observation, reward, termination and success of a state that :func:`advance` led to; see :func:`judge`.
-
-    Args:
-        model: The task.
-        state: After the step.
-        actuation: (B, 2, P, P) on the patch, Pa.
-        soft: As in :func:`step`.
-    """
-    return judge(model, _look(model, state, actuation), soft=soft)
 
 
 def judge(model: Model, moment: Moment, *, soft: bool = False) -> StepResult:

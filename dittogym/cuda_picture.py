@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,22 +43,16 @@ class Kernel:
 
     real: str  # "float" or "double"
     threads: int
-    digest: str  # of its sources
 
     @classmethod
     def of(cls, dtype: torch.dtype) -> Kernel:
         """That for positions in a dtype."""
-        return cls({torch.float32: "float", torch.float64: "double"}[dtype], THREADS, _digest())
+        return cls({torch.float32: "float", torch.float64: "double"}[dtype], THREADS)
 
     @property
     def macros(self) -> dict[str, str]:
         """What the compiler must define."""
         return {"TORCHMPM_REAL": self.real, "TORCHMPM_THREADS": str(self.threads), "TORCHMPM_SHARED": "1"}
-
-
-@functools.cache
-def _digest() -> str:
-    return hashlib.sha256(_SOURCE.read_bytes() + _SOURCE.with_suffix(".hpp").read_bytes()).hexdigest()
 
 
 def draw(driver: Driver, kernel: Any, arrays: Mapping[str, Tensor], full: float, **constants: Any) -> None:

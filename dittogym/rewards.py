@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from dittogym.copies import constant
 from dittogym.observation import silhouette, soft_silhouette
-from torchmpm import ParticleState
+from torchmpm import ParticleState, tree
 from torchmpm.materials.linalg import safe_sqrt
 
 #: The radius of gyration of a torn robot is not counted beyond this, m.
@@ -26,7 +26,9 @@ SELECTION_WIDTH = 0.005
 TaskState: TypeAlias = Mapping[str, Tensor]
 
 
-class Features(NamedTuple):
+@tree.register
+@dataclass(frozen=True, eq=False)
+class Features:
     """Averages over the bodies of a state.
 
     Attributes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 PROGRAM = Path(__file__).resolve().parents[1] / "benchmarks/gpu.py"
 spec = importlib.util.spec_from_file_location("gpu_program", PROGRAM)
@@ -80,7 +80,7 @@ def test_a_figure_beyond_its_bound_or_no_number_is_wrong(value):
     assert gpu.judged({"x": 1.0}, {"x": 1.0})["wrong"] == []
 
 
-needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+needs_compiler = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 
 @needs_compiler

@@ -1,17 +1,10 @@
-"""Names of the backends, and what they need."""
+"""Names of the backends, and the warning where one is many times slower than it could be."""
 
 import functools
 import logging
 
-from torchmpm.native.library import find_compiler
-
 BACKENDS = ("auto", "eager", "native")
 _logger = logging.getLogger(__name__)
-
-
-def compiler_found() -> bool:
-    """Whether there is a C++ compiler: $CXX, g++ or clang++."""
-    return find_compiler() is not None
 
 
 @functools.cache

@@ -202,7 +202,7 @@ class Solver:
                 is not finite, or far from its matter, does not move and harms no other.
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`. The native
                 backend keeps the start of a segment and replays its substeps onto a tape; ``"auto"`` and ``None`` make
-                its segments as long as the memory that it keeps for tapes.
+                its segments as long as a tape may be.
 
         Returns:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.

@@ -23,7 +23,7 @@ LARGEST_CACHE = 64
 
 
 def register(cls: type[Tree]) -> type[Tree]:
-    """Class decorator that registers a dataclass as a pytree whose children are its fields.
+    """Class decorator that registers a dataclass as a pytree whose children are its fields that are not ``None``.
 
     Instances rebuilt from leaves are those of :func:`unchecked`, because transforms such as ``torch.func.vmap`` put
     leaves of other shapes in their place.
@@ -33,10 +33,16 @@ def register(cls: type[Tree]) -> type[Tree]:
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
-    def flatten(instance: Tree) -> tuple[list[Any], None]:
-        return [getattr(instance, name) for name in names], None
+    def flatten(instance: Tree) -> tuple[list[Any], tuple[str, ...]]:
+        # None is no leaf, as torch.func.vmap refuses leaves that are not tensors.
+        given = tuple(name for name in names if getattr(instance, name) is not None)
+        return [getattr(instance, name) for name in given], given
 
-    pytree.register_pytree_node(cls, flatten, lambda children, _: unchecked(cls, *children))
+    def unflatten(children: Iterable[Any], given: tuple[str, ...]) -> Tree:
+        values = dict(zip(given, children, strict=True))
+        return unchecked(cls, *[values.get(name) for name in names])
+
+    pytree.register_pytree_node(cls, flatten, unflatten)
     return cls
 
 

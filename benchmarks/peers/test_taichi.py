@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import torchmpm
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 ti = pytest.importorskip("taichi")
 
@@ -53,7 +53,7 @@ def peer(name: str, batch: int, count: int, history: int) -> TaichiRobot:
 
 def cases(**sizes: str) -> pytest.MarkDecorator:
     """Size by size, so that what is compared runs within the same minute."""
-    needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+    needs_compiler = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
     return pytest.mark.parametrize(
         ("backend", "size"),
         [

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -184,9 +183,9 @@ def check_place(spec: TaskSpec) -> None:
     """
     points = probe(spec.robot)
     origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
-    for index, other in enumerate(spec.objects):
-        _check_body(spec, f"objects[{index}]", probe(other), *_bounds(other), origin)
     check_robot_at(spec, points, *_bounds(spec.robot))
+    for index, other in enumerate(spec.objects):
+        _check_free(spec, f"objects[{index}]", probe(other), *_bounds(other))
     split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
     if limit is not None and split >= limit:
         raise ValueError(f"robot must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")
@@ -195,14 +194,20 @@ def check_place(spec: TaskSpec) -> None:
 
 
 def check_robot_at(spec: TaskSpec, points: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
-    """Refuse a robot with these points (n, 2) and corners (2,) outside the window, in an obstacle, or at the object."""
+    """Refuse a robot with these points (n, 2) and corners (2,) outside the window, in an obstacle, or at the object.
+
+    A window that moves with the robot must not leave an object behind.
+    """
     origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
-    place = _check_body(spec, "robot", points, low, high, origin)
+    for index, other in enumerate(spec.objects):
+        _check_in_window(f"objects[{index}]", *_bounds(other), origin)
+    _check_in_window("robot", low, high, origin)
+    _check_free(spec, "robot", points, low, high)
     for other in spec.objects:
         first, last = _bounds(other)
         if _any_inside(points, first, last):
-            free = f"{first[0]:.3f} < x < {last[0]:.3f}, {first[1]:.3f} < y < {last[1]:.3f}"
-            raise ValueError(f"robot must leave the place of the object free, {free}, got {place}")
+            place = _box(low, high)
+            raise ValueError(f"robot must leave the place of the object free, {_box(first, last)}, got {place}")
 
 
 def _bounds(body: BodySpec) -> tuple[np.ndarray, np.ndarray]:
@@ -211,19 +216,22 @@ def _bounds(body: BodySpec) -> tuple[np.ndarray, np.ndarray]:
     return low, low + body.shape.size
 
 
-def _check_body(
-    spec: TaskSpec, name: str, points: np.ndarray, low: np.ndarray, high: np.ndarray, origin: torch.Tensor
-) -> str:
-    """Where a body lies, with points (n, 2): inside the window at ``origin`` (1, 2) and outside the obstacles."""
-    place = f"{low[0]:.3f} < x < {high[0]:.3f}, {low[1]:.3f} < y < {high[1]:.3f}"
+def _check_in_window(name: str, low: np.ndarray, high: np.ndarray, origin: torch.Tensor) -> None:
     if not bool(contains(torch.from_numpy(np.stack((low, high))[None]), origin).all()):
-        raise ValueError(f"{name} must lie inside the window ({window_range(origin)}), got {place}")
+        raise ValueError(f"{name} must lie inside the window ({window_range(origin)}), got {_box(low, high)}")
+
+
+def _check_free(spec: TaskSpec, name: str, points: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
     for obstacle in spec.obstacles:
         for box in () if obstacle.rules == () else obstacle.boxes:
             if _any_inside(points, (box.left, box.bottom), (box.right, box.top)):
                 solid = f"{box.left:.4g} < x < {box.right:.4g}, {box.bottom:.4g} < y < {box.top:.4g}"
-                raise ValueError(f"{name} must start outside the obstacle {obstacle.name!r} ({solid}), got {place}")
-    return place
+                got = _box(low, high)
+                raise ValueError(f"{name} must start outside the obstacle {obstacle.name!r} ({solid}), got {got}")
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> str:
+    return f"{low[0]:.3f} < x < {high[0]:.3f}, {low[1]:.3f} < y < {high[1]:.3f}"
 
 
 def window_range(origin: torch.Tensor) -> str:
@@ -231,5 +239,6 @@ def window_range(origin: torch.Tensor) -> str:
     return f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
 
 
-def _any_inside(points: np.ndarray, low: npt.ArrayLike, high: npt.ArrayLike) -> bool:
-    return bool(((points > low) & (points < high)).all(1).any())
+def _any_inside(points: np.ndarray, low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> bool:
+    x, y = points.T  # many times faster than a reduction over an axis of two
+    return bool(((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])).any())

@@ -284,6 +284,7 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
             raise ValueError(f"policy must return actions, got {type(chosen).__name__}: {error}") from error
         observation, *end = env.step(action)
         images, ended = observation.cpu().numpy(), bool(end[1][index] | end[2][index])
+        action = action.float() if action.dtype == torch.bfloat16 else action  # which NumPy does not have
         yield images, action.cpu().numpy(), end
 
 

@@ -182,6 +182,10 @@ VALUES = [
     ("robot room, got shift=0.2 and turn=0", lambda: grow(shift=0.2)),
     ("the obstacle 'right beam'", lambda: grow(turn=45.0)),
     ("place of the object", lambda: env(task="kick", conditions={"shift": 0.15})),
+    # Between the largest shifts, where the robot is behind the object or the stair; and with the object left behind.
+    ("place of the object", lambda: env(task="kick", conditions={"shift": 0.4})),
+    ("the obstacle 'stair 0'", lambda: env(task="obstacle", conditions={"shift": 0.4})),
+    ("objects[0] must lie inside the window", lambda: env(task="kick", conditions={"shift": 0.6})),
     # Resets, snapshots and states.
     *(("seed", lambda seed=seed: reset(seed)) for seed in (1.5, 2**32 - 1, [1], [1, -2])),
     ("options", lambda: env().reset(options=[1])),

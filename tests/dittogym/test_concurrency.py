@@ -13,9 +13,9 @@ import torch
 from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 
 from dittogym import TorchEnv
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
-BACKENDS = ["eager", pytest.param("native", marks=pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"))]
+BACKENDS = ["eager", pytest.param("native", marks=pytest.mark.skipif(not find_compiler(), reason="no C++ compiler"))]
 
 #: What a user's program does: it has simulated with all its threads, then starts processes that simulate too.
 PROGRAM = """

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import importlib.util
 import math
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,24 +21,24 @@ from torch import Tensor
 import dittogym
 from dittogym import cuda_picture
 from dittogym.observation import cuda_drawing
-from torchmpm.backends import compiler_found
 from torchmpm.native.cuda import compiler
 from torchmpm.native.cuda.compiler import FOLDERS
 from torchmpm.native.cuda.driver import Launch
-from torchmpm.native.library import build
+from torchmpm.native.library import build, find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 HERE = Path(__file__).resolve().parent
 IMITATION = HERE.parent / "torchmpm" / "imitation"
+SOURCE = Path(cuda_picture.Kernel.source)
 CPU = torch.device("cpu")
 THREADS = 32
 
 
 @functools.cache
 def library(kernel: cuda_picture.Kernel) -> ctypes.CDLL:
-    folders = (*FOLDERS, IMITATION, Path(dittogym.__file__).parent)
-    digest = hashlib.sha256(kernel.digest.encode())
-    for file in sorted(file for folder in (FOLDERS[0], IMITATION) for file in folder.glob("*.[ch]*")):
+    folders = (*FOLDERS, IMITATION, SOURCE.parent)
+    digest = hashlib.sha256(compiler.digest_of_sources(SOURCE.parent).encode())
+    for file in sorted(IMITATION.glob("*.[ch]*")):
         digest.update(file.read_bytes())
     named = kernel.macros | {"TORCHMPM_THREADS": str(THREADS), "DIGEST": digest.hexdigest()[:16]}
     options = [*(f"-D{name}={value}" for name, value in named.items()), *(f"-I{folder}" for folder in folders)]
@@ -141,3 +142,23 @@ def test_a_kernel_that_draws_something_else_is_not_used() -> None:
     camera = tiny("run").model.camera
     with pytest.raises(ValueError, match="a pixel differed by"):
         cuda_drawing(camera, torch.float32, CPU, Idle())
+
+
+@pytest.mark.parametrize("changed", ["picture.cu", "picture.hpp"])
+def test_a_change_of_a_source_makes_another_kernel(
+    changed: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    compiled: list[Path] = []
+    for name in ("picture.cu", "picture.hpp"):
+        shutil.copy(SOURCE.with_name(name), tmp_path)
+    monkeypatch.setattr(cuda_picture.Kernel, "source", str(tmp_path / "picture.cu"))
+    monkeypatch.setattr(compiler, "compile_source", lambda *_, folder: compiled.append(folder) or b"binary")
+    monkeypatch.setattr(compiler, "_versions", lambda: (1, 13, 0))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    kernel = cuda_picture.Kernel.of(torch.float32)
+    for count in (1, 1, 2):
+        if count == 2:
+            with (tmp_path / changed).open("a") as file:
+                file.write("// changed")
+        compiler.compile_kernel(kernel, "sm_90")
+        assert compiled == [tmp_path] * count

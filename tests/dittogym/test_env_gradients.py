@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dittogym import TorchEnv, make_spec
 from dittogym.spec import TaskSpec
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 TASKS = ("shapematch", "run", "kick", "dig")
 STEPS, SUBSTEPS, B = 2, 6, 2
@@ -157,7 +157,7 @@ def test_checkpoints_make_no_difference(task: str) -> None:
         assert_near(found, expected, tolerance)
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 @pytest.mark.parametrize("per_particle", [False, True])
 @pytest.mark.parametrize("task", TASKS)
 def test_native_adjoint(task: str, per_particle: bool) -> None:

@@ -9,9 +9,9 @@ from tiny import TASKS, actions, on_edge, set_particles, tiny
 
 import dittogym
 from dittogym import core
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 
 def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,7 +8,8 @@ import torch
 from tiny import TASKS, tiny
 
 import dittogym
-from dittogym.core import StepResult, evaluate
+from dittogym import core
+from dittogym.core import StepResult
 from dittogym.observation import silhouette
 
 
@@ -52,7 +53,8 @@ def judge(
     entries = {name: torch.full_like(state.task_state[name], value) for name, value in (task_state or {}).items()}
     particles = replace(state.particles, x=x, v=v)
     state = replace(state, particles=particles, origin=origin, task_state={**state.task_state, **entries})
-    return evaluate(env.model, state, torch.zeros(1, 2, env.spec.patch, env.spec.patch, dtype=env.dtype))
+    field = torch.zeros(1, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
+    return core.judge(env.model, core.look(env.model, state, field))
 
 
 @pytest.mark.parametrize(

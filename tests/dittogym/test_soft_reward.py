@@ -9,8 +9,8 @@ import torch
 from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
-from dittogym import TorchEnv
-from dittogym.core import EnvState, evaluate
+from dittogym import TorchEnv, core
+from dittogym.core import EnvState
 from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
@@ -26,7 +26,7 @@ def normal(*shape: int, seed: int = 1) -> Tensor:
 def reward(env: TorchEnv, state: EnvState, soft: bool = False) -> Tensor:
     """The task's reward (B,) of a state, under a full actuation."""
     field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    return evaluate(env.model, state, field, soft=soft).reward
+    return core.judge(env.model, core.look(env.model, state, field), soft=soft).reward
 
 
 def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:

@@ -10,9 +10,9 @@ from torch import Tensor
 from dittogym import TorchEnv, core, make_spec
 from dittogym.action import bicubic
 from dittogym.core import EnvState
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler: thousands of substeps take too long")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler: thousands of substeps take too long")
 
 STEPS = 8
 

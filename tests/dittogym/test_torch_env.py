@@ -163,8 +163,14 @@ def test_bad_input_changes_nothing(conditions: dict | None) -> None:
 
 @pytest.mark.parametrize("backend", ["auto", "eager"])
 @pytest.mark.parametrize("task", ["run", "slot"])
-def test_a_failed_element_leaves_shared_gradients_alone(task: str, backend: str) -> None:
-    """In one action for all and one constant for all: the same as of the intact element by itself."""
+@pytest.mark.parametrize(("count", "speed"), [(None, torch.nan), (1, torch.nan), (1, 1e200)])
+def test_a_failed_element_leaves_shared_gradients_alone(
+    task: str, backend: str, count: int | None, speed: float
+) -> None:
+    """In one action for all and one constant for all: the same as of the intact element by itself.
+
+    One particle that is fast draws the centre, and with it a window that moves, away from all others.
+    """
     found = []
     for batch in (1, 2):
         env = small(task, batch, particles=60, substeps=4, backend=backend)
@@ -174,7 +180,7 @@ def test_a_failed_element_leaves_shared_gradients_alone(task: str, backend: str)
         action = shared.expand(batch, -1, -1, -1)
         env.step(action)
         v = env.state.v.clone()
-        v[1:] = torch.nan
+        v[1:, :count] = speed
         env.env_state = replace(env.env_state, particles=replace(env.state, v=v))
         rewards = [env.step(action, soft=soft)[1] for soft in (True, False)]
         assert torch.equal(rewards[0][1:], torch.full((batch - 1,), FAILURE_REWARD, dtype=torch.float64))

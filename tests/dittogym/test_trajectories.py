@@ -6,6 +6,7 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 import dittogym
 from dittogym import trajectories
@@ -59,6 +60,12 @@ def test_batch_of_one_records_the_same(episodes):
     again = trajectories.record(batch, noise(7), seed=7)
     assert list(again.particles) == ["x", "v"] and np.array_equal(again.particles["x"], episodes[1].particles["x"])
     assert np.array_equal(again.actions, episodes[1].actions) and np.array_equal(again.rewards, episodes[1].rewards)
+
+
+def test_actions_in_bfloat16_are_recorded():
+    env = dittogym.TorchEnv("shapematch", **OPTIONS)
+    episode = trajectories.record(env, lambda images: torch.full((1, *env.action_shape), 0.1, dtype=torch.bfloat16))
+    assert episode.actions.dtype == np.float32 and (episode.actions == float(torch.tensor(0.1).bfloat16())).all()
 
 
 def test_archive_gives_the_same_back(episodes, tmp_path):

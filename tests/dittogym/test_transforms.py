@@ -39,6 +39,19 @@ def test_transforms_of_the_pure_step_give_what_autograd_gives(task: str) -> None
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12 * theirs.abs().max().item())
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_vmap_maps_over_states(task: str) -> None:
+    """In tasks with and without an object."""
+    env = tiny(task, 2, backend="eager", substeps=2)
+    env.reset(seed=0)
+    alone = [tree.map(lambda tensor, i=i: tensor[i : i + 1], env.env_state) for i in range(2)]
+    drive = actions(env, 1)[0][:, None]
+    states = tree.map(lambda *tensors: torch.stack(tensors), *alone)
+    found = torch.func.vmap(lambda state, action: core.step(env.model, state, action).reward)(states, drive)
+    expected = [core.step(env.model, state, action).reward for state, action in zip(alone, drive, strict=True)]
+    torch.testing.assert_close(found, torch.stack(expected), rtol=1e-9, atol=1e-12)
+
+
 def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
     env, drive = tiny("run", 2), torch.zeros(2, 2, 8, 8)
     env.reset(seed=0)

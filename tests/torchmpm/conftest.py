@@ -5,13 +5,13 @@ from collections.abc import Iterator
 import pytest
 import scenes
 
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 
 @pytest.fixture(scope="module", params=["eager", "native"])
 def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """The backend of all solvers made by :mod:`scenes`; ask for it with ``pytestmark``."""
-    if request.param == "native" and not compiler_found():
+    if request.param == "native" and not find_compiler():
         pytest.skip("no C++ compiler")
     scenes.BACKEND, before = request.param, scenes.BACKEND
     yield request.param

@@ -13,8 +13,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
 from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory, tree
-from torchmpm.backends import compiler_found
 from torchmpm.native import library
+from torchmpm.native.library import find_compiler
 from torchmpm.substep import Components, Scene
 
 
@@ -29,7 +29,7 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.message for record in caplog.records if record.name == "torchmpm.backends"]
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 def test_auto_is_native_where_that_works(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
     state = lively(30)
     results = [robot(30, backend=backend).step(state, substeps=5) for backend in ("auto", "native")]
@@ -89,7 +89,7 @@ def test_auto_is_eager_where_the_kernels_do_not_work(
     assert torch.equal(eager.x, state.x) == (name != "Own")
     (message,) = messages(caplog)
     assert name in message
-    if compiler_found():
+    if find_compiler():
         with pytest.raises(ValueError, match=name):
             kind(grid, (body,), backend="native").step(state)
 

@@ -23,11 +23,11 @@ from test_native_adjoint import (
 from torch import Tensor
 
 from torchmpm import Grid, ParticleState, Solver
-from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
 from torchmpm.native.cuda.compiler import FOLDERS
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 COUNT = 60
 every_plan = pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)

@@ -29,10 +29,10 @@ from test_resolved import hard_soil, hardened
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 from torchmpm.solver import kernels_fail
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 COUNT = 60
 ON_A_GPU = pytest.param("cuda", marks=pytest.mark.cuda)
 on_a_gpu = pytest.mark.parametrize("device", [ON_A_GPU], indirect=True)

@@ -13,11 +13,11 @@ from native_scenes import NAMES, assert_lost_alone, lost, moving, solvers
 from scenes import assert_as_precise, assert_close, assert_identical, lively, normal, robot
 
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
-from torchmpm.backends import compiler_found
 from torchmpm.grid import PAD
 from torchmpm.native.kernels import MAX_PARTICLES, MAX_RESOLUTION
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 COUNT = 300
 

@@ -10,10 +10,10 @@ from scenes import Leaves, assert_identical, combination, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
-from torchmpm.backends import compiler_found
 from torchmpm.native import kernels
+from torchmpm.native.library import find_compiler
 
-pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+pytestmark = pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 
 COUNT = 120
 STATE = ("x", "v", "C", "F", "Jp")
@@ -168,13 +168,22 @@ def test_friction_that_just_stops_a_node_has_the_derivative_of_sliding() -> None
     assert found[0].tolist() == [[[pytest.approx(1.0), pytest.approx(1.0)]]]
 
 
+def cut(patch: pytest.MonkeyPatch, solver: Solver, count: int, substeps: int) -> None:
+    """Cut long steps with gradients into pieces of so many substeps."""
+    limit = solver.kernels.tape_limit(torch.empty(13, 1, count).double())
+    patch.setattr(kernels, "TAPE_BYTES", substeps * kernels.TAPE_BYTES // limit)
+
+
+@pytest.mark.parametrize("pieces", [False, True])
 @pytest.mark.parametrize("batch", [1, 3])
-def test_threads_make_no_difference(batch: int) -> None:
+def test_threads_make_no_difference(batch: int, pieces: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit by bit: sums are taken in one order, also over the particles or simulations that share a constant."""
     given = state_leaves(2700, batch) | value_leaves(2700, batch)
     leaves = {name: value.requires_grad_() for name, value in given.items()}
     start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(2700, leaves), backend="native")
     before, results = torch.get_num_threads(), []
+    if pieces:
+        cut(monkeypatch, solver, 2700, 3)
     try:
         for threads in (1, 2, 2, 5):
             torch.set_num_threads(threads)
@@ -184,6 +193,28 @@ def test_threads_make_no_difference(batch: int) -> None:
         torch.set_num_threads(before)
     for result in results[1:]:
         assert all(map(torch.equal, result, results[0]))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_a_simulation_alone_has_the_gradients_it_has_in_a_batch(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit by bit, in pieces of a step, in all that belongs to one simulation."""
+    given = state_leaves(300, 3) | value_leaves(300, 3)
+    wanted = [name for name, value in given.items() if value.shape[:1] == (3,)]
+    cut(monkeypatch, replace(varied(300, given), backend="native"), 300, 3)
+
+    def slopes(chosen: slice) -> tuple[Tensor, ...]:
+        leaves = given | {name: given[name][chosen].clone().requires_grad_() for name in wanted}
+        start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(300, leaves), backend="native")
+        final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
+        return torch.autograd.grad(final.stack().square().sum(), [leaves[name] for name in wanted])
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        together, alone = slopes(slice(None)), [slopes(slice(i, i + 1)) for i in range(3)]
+    finally:
+        torch.set_num_threads(before)
+    assert all(map(torch.equal, together, map(torch.cat, zip(*alone, strict=True))))
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,8 +229,7 @@ def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
         return gradients(lambda _: solver, given, ("x", "v", "actuation", "origin"), 10, "native"), end
 
     slopes, end = results()
-    limit = solver.kernels.tape_limit(torch.empty(13, 2, 60).double())
-    monkeypatch.setattr(kernels, "KEPT_BYTES", 4 * kernels.KEPT_BYTES // limit)
+    cut(monkeypatch, solver, 60, 4)
     monkeypatch.setattr(kernels, "MIN_SUBSTEPS", 3)
     slopes_in_pieces, end_in_pieces = results()
     assert calls == [10, 10, *(3, 3, 3, 1), *(4, 4, 2)]

@@ -14,7 +14,7 @@ from scenes import assert_close, assert_identical, generator
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, diagnostics
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -179,7 +179,7 @@ def test_elements_of_a_batch_do_not_know_each_other(case: Case, random) -> None:
                 assert_close(other, alone, 1e-11)
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 @settings(max_examples=25)
 @given(cases())
 def test_backends_agree(case: Case) -> None:

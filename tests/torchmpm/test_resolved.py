@@ -10,7 +10,7 @@ from scenes import Leaves, normal, robot
 from test_native_adjoint import compare_gradients, gradients, state_leaves
 
 from torchmpm import Body, Snow, Solver
-from torchmpm.backends import compiler_found
+from torchmpm.native.library import find_compiler
 
 COUNT = 24
 #: Of the soil below: the hardening factor at which a substep becomes unstable, as in DIG below the bound of 5.
@@ -91,7 +91,7 @@ def test_states_are_those_of_the_exact_gradient() -> None:
     scenes.assert_identical(*(hard_soil(exact_gradients=exact).step(state, substeps=30) for exact in (False, True)))
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize(("substeps", "lam"), [(1, 4e4), (25, 4e4), (1, -2e4)])
 def test_backends_agree(batch: int, substeps: int, lam: float) -> None:
@@ -99,7 +99,7 @@ def test_backends_agree(batch: int, substeps: int, lam: float) -> None:
     compare_gradients(lambda _: hard_soil(lam=lam), given, tuple(given), substeps, 1e-9)
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
 def test_gradients_of_hard_soil_do_not_grow() -> None:
     """Of soil at rest, hardened to 5, where the exact ones grow in every substep."""
     still = scenes.ParticleState.at_rest(scenes.positions(COUNT))

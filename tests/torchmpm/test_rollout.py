@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchmpm import Body, Elastic, ParticleState, Solver, repeated, trajectory
-from torchmpm.backends import compiler_found
 from torchmpm.materials.body import METHODS
+from torchmpm.native.library import find_compiler
 
-NATIVE = pytest.param("native", marks=pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"))
+NATIVE = pytest.param("native", marks=pytest.mark.skipif(not find_compiler(), reason="no C++ compiler"))
 CHANGED = "in.?place"
 
 

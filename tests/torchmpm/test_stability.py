@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scenes import GRID, generator, normal, positions
 
 from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VonMises, lame
-from torchmpm.backends import compiler_found
 from torchmpm.materials.linalg import Mat2
+from torchmpm.native.library import find_compiler
 from torchmpm.substep import muscle_stress
 
 MU, LAM = 300.0, 200.0
@@ -76,7 +76,7 @@ def test_a_particle_alone_is_stable_up_to_it_and_not_beyond() -> None:
 @given(st.integers(1, 80), st.sampled_from([0.02, 0.1, 0.3]), st.integers(0, 999))
 def test_small_strains_of_any_arrangement_stay_small(count: int, size: float, seed: int) -> None:
     x = 0.35 + size * torch.rand(1, count, 2, generator=generator(seed), dtype=torch.float64)
-    solver = at_limit(count, 0.99, "native" if compiler_found() else "eager")
+    solver = at_limit(count, 0.99, "native" if find_compiler() else "eager")
     # Strains may grow for a while, by 48 in the worst case found (in 3,000 substeps), but not without bound.
     assert growth(solver, ParticleState.at_rest(x), 200) < 100
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import pytest
 import torch
 from scenes import assert_identical, lively, robot
 from torch import Tensor
@@ -35,6 +36,26 @@ def test_map_reaches_every_tensor_of_nested_containers() -> None:
     assert torch.equal(doubled.pair.first, 2 * nested(1).pair.first) and doubled.pair.second is None
     assert doubled.memory["steps"].tolist() == [2, 2, 2]
     assert len(tree.leaves(doubled)) == 7
+
+
+@tree.register
+@dataclass(frozen=True)
+class Perhaps:
+    first: Tensor | None
+    second: Tensor | None = None
+    third: float = 1.0
+
+
+def test_fields_that_are_none_are_no_leaves() -> None:
+    """They stay None, vmap takes such trees, and those with other fields have another structure."""
+    some = Perhaps(None, torch.ones(3), 2.0)
+    doubled = tree.map(lambda tensor: 2 * tensor, some)
+    assert doubled.first is None and doubled.second.tolist() == [2.0] * 3 and doubled.third == 2.0
+    swap = torch.func.vmap(lambda each: Perhaps(each.second, None, each.third))
+    mapped = swap(Perhaps(None, torch.ones(3), torch.ones(3)))
+    assert mapped.first.tolist() == [1.0] * 3 and mapped.second is None
+    with pytest.raises(ValueError):
+        tree.map(torch.add, some, Perhaps(torch.ones(3), None, 2.0))
 
 
 def test_where_selects_whole_batch_elements() -> None:

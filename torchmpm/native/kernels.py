@@ -26,10 +26,9 @@ from torchmpm.state import ParticleState
 MAX_RULES = 255
 #: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
-#: Scratch memory of the CPU up to this size, bytes, is kept for the next call, as fresh pages cost a third of a
-#: backward pass. It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps
-#: are cut. Simulations that run at the same time share it.
-KEPT_BYTES = 2**28
+#: Tape of one simulation on the CPU, bytes: 49 substeps of 22,000 particles in single precision. Longer steps are cut,
+#: alike for any number of threads and simulations, as sums over other pieces would be rounded differently.
+TAPE_BYTES = 2**26
 #: A call on the CPU without gradients is not cut into smaller pieces: as many substeps as a control step has.
 MIN_SUBSTEPS = 100
 #: Share of a GPU's memory that the tape of one simulation may take; as many at once as fit have one.
@@ -114,7 +113,7 @@ class Kernels:
         if not taped and not inputs.components.is_cuda:
             # Python hears of Ctrl-C between calls, which take some tenths of a second.
             rounds = math.ceil(state.batch_size / torch.get_num_threads())
-            limit = max(MIN_SUBSTEPS, self.tape_limit(inputs.components[:, :1]) // rounds)
+            limit = max(MIN_SUBSTEPS, self.tape_limit(inputs.components) // rounds)
         for start in range(0, substeps, limit):
             components = Step.apply(self.tables, min(limit, substeps - start), *inputs[:6])
             inputs = inputs._replace(components=components)
@@ -122,13 +121,13 @@ class Kernels:
 
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
-        rows, batch, particles = components.shape
+        rows, _, particles = components.shape
         substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
         if components.is_cuda:
             memory = torch.cuda.get_device_properties(components.device).total_memory
             limit = int(CUDA_TAPE_SHARE * memory) // substep
         else:
-            limit = KEPT_BYTES // (substep * min(batch, torch.get_num_threads()))
+            limit = TAPE_BYTES // substep
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
 
 
@@ -244,7 +243,7 @@ def call(name: str, inputs: Inputs, tables: Tables, substeps: int, **outputs: Te
             raise MemoryError("backend 'native' ran out of memory")
 
 
-#: Scratch memory that no call is using.
+#: Scratch memory that no call is using. One buffer is kept, as fresh pages cost a third of a backward pass.
 _free_scratch: list[Tensor] = []
 
 
@@ -259,5 +258,5 @@ def _scratch(size: int) -> Iterator[int]:
         del buffer
         buffer = torch.empty(size + 64, dtype=torch.uint8, device="cpu")
     yield (buffer.data_ptr() + 63) // 64 * 64
-    if buffer.numel() <= KEPT_BYTES and not _free_scratch:
+    if not _free_scratch:
         _free_scratch.append(buffer)

@@ -101,13 +101,14 @@ def compile_source(
 
 def _key(kernel: Kernel, arch: str) -> str:
     """Hash of everything that a binary depends on."""
-    facts = f"{kernel} {arch} {sorted(_ROUNDING.items())} {_versions()} {digest_of_sources()}"
+    sources = digest_of_sources(path_of(kernel).parent)
+    facts = f"{kernel} {arch} {sorted(_ROUNDING.items())} {_versions()} {sources}"
     return hashlib.sha256(facts.encode()).hexdigest()[:24]
 
 
-def digest_of_sources() -> str:
-    """Hash of everything that the kernels are compiled from."""
-    digest, files = hashlib.sha256(), (file for folder in FOLDERS for file in folder.iterdir())
+def digest_of_sources(folder: Path = FOLDERS[0]) -> str:
+    """Hash of everything that the kernels in a folder are compiled from."""
+    digest, files = hashlib.sha256(), (file for each in {folder, *FOLDERS} for file in each.iterdir())
     for file in sorted(file for file in files if file.suffix in (".cu", ".cuh", ".hpp")):
         digest.update(file.name.encode() + file.read_bytes())
     return digest.hexdigest()
