@@ -121,11 +121,6 @@ class Learner(ABC):
     def trained_policy(self) -> Policy:
         """What has been learned so far, as `save_policy` writes it."""
 
-    @property
-    def acting_policy(self) -> Policy:
-        """The same to act by now, not to keep: it may share its weights with what is in training."""
-        return self.trained_policy
-
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
         policy = cast(Shareable, self.trained_policy)
@@ -251,7 +246,7 @@ class UpdateLoop(BaseAlgorithm, Learner):
         Returns:
             Actions, and the memory for the next call.
         """
-        policy = self.acting_policy if self.env is None else attached(self.acting_policy, self.simulation)
+        policy = self.trained_policy if self.env is None else attached(self.trained_policy, self.simulation)
         actions, memory = policy.predict(observation, state, episode_start, deterministic)
         return actions, memory
 
@@ -306,15 +301,7 @@ class CoarseToFine(Learner):
     @property
     def trained_policy(self) -> ActorPolicy:
         """What has been learned so far."""
-        return self._policy(shared=False)
-
-    @property
-    def acting_policy(self) -> ActorPolicy:
-        """The same to act by now, not to keep: a copy of the networks would take longer than an action."""
-        return self._policy(shared=True)
-
-    def _policy(self, shared: bool) -> ActorPolicy:
-        return ActorPolicy(self.spec, self.config.eval_deterministic, self.trained_actor, shared)
+        return ActorPolicy(self.spec, self.config.eval_deterministic, self.trained_actor)
 
     @classmethod
     def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:

@@ -111,28 +111,17 @@ class ActorPolicy(nn.Module, Shareable):
         spec: Structure of the actor.
         deterministic_by_default: Whether the run that trained it evaluates it without noise.
         actor: Of that structure, which is copied; None: one with random weights.
-        shared: Whether to act by ``actor`` itself, also while it is trained, and not by a frozen copy of it.
     """
 
     uses_image = True
     __repr__ = Shareable.__repr__  # that of a module lists every layer
 
-    def __init__(
-        self,
-        spec: ActorSpec,
-        deterministic_by_default: bool = False,
-        actor: Actor | None = None,
-        shared: bool = False,
-    ) -> None:
+    def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False, actor: Actor | None = None) -> None:
         super().__init__()
         self.spec = spec
         self.deterministic_by_default = deterministic_by_default
         self.description: dict[str, Any] = {}
-        if actor is None:
-            actor = build_actor(spec).requires_grad_(False)
-        elif not shared:
-            actor = copy.deepcopy(actor).requires_grad_(False)
-        self.actor = actor
+        self.actor = (build_actor(spec) if actor is None else copy.deepcopy(actor)).requires_grad_(False)
         self.observation_space = spaces.Box(0, 255, SHAPE, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2, self.resolution, self.resolution), np.float32)
 

@@ -243,18 +243,6 @@ def test_the_policy_of_an_actor_is_a_copy_made_without_random_numbers():
     np.testing.assert_array_equal(policy.predict(images(), deterministic=True)[0], before)
 
 
-def test_a_policy_that_shares_its_actor_follows_its_training_and_does_not_stop_it():
-    spec = ActorSpec((4, 8), (-1.0,))
-    actor = build_actor(spec)
-    trained = len(actor.trainable_parameters())
-    policy = cfp.ActorPolicy(spec, True, actor, shared=True)
-    before = policy.predict(images(), deterministic=True)[0]
-    with torch.no_grad():
-        actor.mean[0].weight.add_(1.0)
-    assert not np.array_equal(policy.predict(images(), deterministic=True)[0], before)
-    assert len(actor.trainable_parameters()) == trained > 0
-
-
 def test_loading_a_policy_imports_neither_tensorboard_nor_tyro():
     program = "import sys, cfp; cfp.load('run'); print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
