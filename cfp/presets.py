@@ -147,7 +147,7 @@ def preset(task: str, name: Preset = "quick", algo: str | None = None) -> SACCon
             has its own action grids, with ``"cfp-sac"`` the numbers of RUN, and no preset ``"paper"``.
         name: ``"paper"``: the published numbers, one robot with full particles, and the reference's interpolation.
             ``"quick"``: several robots with fewer particles, minutes instead of days. For ``"cfp-sac"`` also
-            ``"long"``, the same as ``"quick"`` with about ten times as many steps: one to five hours of a core.
+            ``"long"``, the same as ``"quick"`` with more steps: half an hour (SHAPE MATCH) to three hours of a core.
         algo: ``"cfp-analytic"`` or ``"cfp-sac"``; by default ``"cfp-analytic"`` for ``"quick"``, and ``"cfp-sac"`` for
             the other presets, which have no other.
 
@@ -228,15 +228,16 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
     task, quick = paper.task, name == "quick"
     horizon, many = dittogym.make_spec(task).horizon, task in MANY_UPDATES
     quick_steps, quick_handover = 48_000 if many else 38_400, 0.75
-    # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. Three
-    # seeds of RUN gained nothing from more steps of the first stage.
-    steps = quick_steps if quick else 320_000
+    # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. RUN gained
+    # nothing from more than 160,000 steps of the first stage, SHAPE MATCH little from more than 60,000.
+    long_steps, long_handover = 90_000 if task == "shapematch" else 240_000, 2 / 3
+    steps = quick_steps if quick else long_steps
     coarse = paper.resolutions[0]
     options: dict[str, Any] = {
         "preset": name,
         "seed": 0,
         "steps": steps,
-        "handover": (quick_handover if quick else 0.5,),
+        "handover": (quick_handover if quick else long_handover,),
         "resolutions": (coarse // 2, coarse) if coarse > 4 else paper.resolutions,
         "random_steps": (480, 100),
         "alpha": (0.5 * paper.alpha[0],),
@@ -262,13 +263,13 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
         "final_rate": 0.1,
         "n_steps": 3,
         "weight_average": 0.998,
-        "eval_every": steps // (8 if quick else 40),
-        "checkpoint_every": steps // (16 if quick else 80),
+        "eval_every": steps // (8 if quick else 24),
+        "checkpoint_every": steps // (16 if quick else 24),
         "log_every": 320 if quick else 1_600,
     } | SAC.get(task, {})
     if not quick:
         critics_alone = options["critics_first"][0] * (quick_handover * quick_steps)
-        options |= {"buffer_size": 100_000, "critics_first": (critics_alone / (0.5 * steps), 0.05)}
+        options |= {"buffer_size": 100_000, "critics_first": (critics_alone / (long_handover * steps), 0.1)}
     return replace(paper, **options)
 
 

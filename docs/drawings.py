@@ -33,6 +33,8 @@ def source(name: str) -> str:
     """Hash of the data that a picture shows, which is stored in its file: a test compares them."""
     if name == "returns.svg":
         data = "".join((DOCS / f"{table}.csv").read_text() for table in ("evaluations", "training"))
+    elif name == "rewards.svg":
+        data = (DOCS / "rewards-long.csv").read_text()
     elif name.startswith("tasks/"):
         data = geometry(Path(name).stem) + constants(Path(name).stem)
     else:
@@ -209,6 +211,38 @@ def draw_returns() -> None:
     save(figure, "returns.svg")
 
 
+def draw_rewards() -> None:
+    """Evaluations during long trainings from rewards, in thousands of steps and of the return."""
+    trainings: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for row in read("rewards-long.csv"):
+        if not row["change"]:
+            point = int(row["step"]) / 1000, int(row["mean"]) / 1000
+            trainings.setdefault((row["task"], row["seed"]), []).append(point)
+    tasks = [task for task in paper.CURVES if (task, "0") in trainings]
+    figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+    for axes, task in zip(figure.subplots(2, 4).flat, tasks, strict=True):
+        for (of, _), points in trainings.items():
+            if of == task:
+                axes.plot(*zip(*points, strict=True), color=OURS, lw=1.2, marker=".", ms=4)
+        zero = float(evaluated(task, "zero", UNDISTURBED, "lite")["mean"])
+        axes.axhline(zero / 1000, color=ZERO, lw=1)
+        axes.axhline(paper.CURVES[task][0][0] / 1000, color=PAPER, lw=1, ls="--")
+        axes.axhline(paper.CURVES[task][1][0] / 1000, color=PAPER, lw=1, ls=":")
+        axes.set_title(name_of(task), fontsize=9)
+        axes.set_xlim(left=0)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("thousand steps", fontsize=9)
+    figure.supylabel("return, thousands", fontsize=9)
+    entries = [
+        Line2D([], [], marker=".", lw=1.2, color=OURS, label="coarse stage, each seed, 2,000 particles"),
+        Line2D([], [], color=PAPER, lw=1, ls="--", label="paper's CFP"),
+        Line2D([], [], color=PAPER, lw=1, ls=":", label="paper's coarse policy"),
+        Line2D([], [], color=ZERO, lw=1, label="zero actions"),
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False)
+    save(figure, "rewards.svg")
+
+
 def main() -> None:
     """Draw everything."""
     draw_step()
@@ -216,6 +250,7 @@ def main() -> None:
     for task in dittogym.TASKS:
         draw_scene(task)
     draw_returns()
+    draw_rewards()
 
 
 if __name__ == "__main__":

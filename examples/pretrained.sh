@@ -4,8 +4,8 @@
 set -e
 
 # run-rewards
-torchmpm train --task run --algo cfp-sac --preset long --resolutions 4 --steps 160000 --seed 1 --eval-every 10000 \
-    --checkpoint-every 10000 --critics-first 0.0027466 --out runs/run-rewards
+torchmpm train --task run --algo cfp-sac --preset long --resolutions 4 --steps 160000 --seed 1 \
+    --critics-first 0.0027466 --out runs/run-rewards
 
 # run: the policies of steps 6,400 and 4,864
 goal=(--task run --refine --resolutions 8 --steps 9600 --max-episode-steps 800 --success-reward 60 --eval-episodes 8)
