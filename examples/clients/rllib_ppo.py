@@ -22,7 +22,7 @@ def make(options):
 
 register_env("run", make)
 ray.init("local", num_cpus=1, include_dashboard=False)
-options = {"particles": 500, "substeps": 10}  # small, so that this takes seconds; leave them out for the real task
+options = {"particles": 500, "substeps": 10}  # small, so that this takes seconds
 config = PPOConfig().environment("run", env_config=options)
 config.env_runners(num_env_runners=0)  # simulates in this process
 config.training(train_batch_size_per_learner=64, minibatch_size=32, num_epochs=1)

@@ -6,7 +6,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import cfp
 import dittogym
 
-options = {"particles": 500, "substeps": 10}  # small, so that this takes seconds; leave them out for the real task
+options = {"particles": 500, "substeps": 10}  # small, so that this takes seconds
 batch = cfp.TorchVecEnv(dittogym.TorchEnv("run", num_envs=2, **options), max_episode_steps=16)
 envs = VecMonitor(batch)  # without it stable-baselines3 logs no returns
 model = PPO("CnnPolicy", envs, n_steps=16, batch_size=16, n_epochs=1, seed=0)  # images are uint8 (3, 64, 64)
