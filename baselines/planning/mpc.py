@@ -14,8 +14,8 @@ from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import NO_REWARD
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.envs.vec_env import reward_error
+from cfp.errors import ConfigError
 from cfp.learner import Scalars, Sees
 from cfp.presets import sac_preset
 from dittogym import TorchEnv, make_spec
@@ -218,10 +218,10 @@ class MPC(OpenLoopLearner):
 
     @torch.no_grad()
     def _carry_out(self, action: Tensor) -> None:
-        _, reward, terminated, _, _ = self.env.step(action)
+        _, reward, terminated, _, info = self.env.step(action)
         self.reward = float(reward)
         if not math.isfinite(self.reward):
-            raise NonFiniteError(NO_REWARD)
+            raise reward_error(info["reward_terms"])
         self.total_reward += self.reward
         self.finished = bool(terminated)
 

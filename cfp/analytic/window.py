@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfp.config import EVALUATION_SEED, WindowConfig
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import DIVERGED, NO_REWARD, TorchVecEnv, first_limits
+from cfp.envs.vec_env import DIVERGED, TorchVecEnv, first_limits, reward_error
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.resumable import Resumable
 from dittogym import TorchEnv, core
@@ -297,7 +297,7 @@ class WindowCollector(Resumable):
             if not outcome.values["acts"]:
                 raise NonFiniteError(DIVERGED)
             if not np.isfinite(outcome.values["true_reward"]):
-                raise NonFiniteError(NO_REWARD)
+                raise reward_error(info["reward_terms"])
             true_reward += float(outcome.values["true_reward"])
             infos = self.episodes.infos(outcome)
             if outcome.values["done"].any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -21,8 +21,6 @@ from torchmpm import checks, tree
 
 #: What is wrong with actions that are not finite.
 DIVERGED = "an action is not finite: the policy has diverged"
-#: What is wrong with rewards that are not finite; where the simulation is not, the reward is a number.
-NO_REWARD = "a reward is not finite: the reward function of the task returned NaN or an infinite number"
 
 
 class TorchVecEnv(VecEnv):
@@ -107,12 +105,19 @@ class TorchVecEnv(VecEnv):
 
     @torch.no_grad()
     def step_wait(self) -> VecEnvStepReturn:
-        """Step with these actions; returns observation, reward (B,) float32, done (B,) bool, and infos."""
+        """Step with these actions; returns observation, reward (B,) float32, done (B,) bool, and infos.
+
+        Raises:
+            NonFiniteError: A reward is NaN or infinite, or an action of ``step_async`` was.
+        """
         assert self._actions is not None, "step_async must be called first"
         step = autoreset_step(self.torch_env, self._actions, self._limits)
         self._actions = None
         if not self._are_finite:  # on a GPU, which the step has waited for already
             raise NonFiniteError(DIVERGED)
+        if not np.isfinite(step.reward).all():
+            head = "reward_terms/"
+            raise reward_error({name.removeprefix(head): step.info[name] for name in step.info if head in name})
         if self._limits is not None:
             self._limits[step.done] = self.max_episode_steps
         infos = _split(step.info)
@@ -185,6 +190,13 @@ def _split(info: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """Turn one dictionary of arrays with a leading B into B dictionaries of numbers."""
     columns = [array.tolist() for array in info.values()]
     return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def reward_error(terms: Mapping[str, Any]) -> NonFiniteError:
+    """The error about a reward that is not finite, with its ``terms``: where the simulation is not, it is a number."""
+    names = [name for name, values in terms.items() if not torch.as_tensor(values).isfinite().all()]
+    reason = "the reward function of the task returned NaN or an infinite number"
+    return NonFiniteError(f"a reward is not finite: {reason}" + (f" for {', '.join(names)}" if names else ""))
 
 
 def keeps_tensors(env: Any) -> bool:

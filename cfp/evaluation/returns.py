@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import choose_device, make_torch_env
-from cfp.envs.vec_env import DIVERGED, NO_REWARD
+from cfp.envs.vec_env import DIVERGED, reward_error
 from cfp.errors import NonFiniteError
 from cfp.messages import progress_bar
 from cfp.policy import Memory, Observation, Policy, Start, attached
@@ -179,7 +179,7 @@ class Trial:
             step |= {name: info[name] for name in info.keys() & {"split", "is_success"}}
             values = to_host(step | {f"term {name}": value for name, value in info["reward_terms"].items()})
             if not np.isfinite(values["reward"]).all():
-                raise NonFiniteError(NO_REWARD)
+                raise reward_error(info["reward_terms"])
             starts = values["done"]
             totals += values["reward"].astype(np.float32)
             for name in info["reward_terms"]:

@@ -406,7 +406,12 @@ class CFP(SAC):
             actions, stored = (part.cpu().numpy() for part in self._act(composition))
         else:
             actions, stored = super()._sample_action(0, action_noise, n_envs)
-        self._check_finite("action", actions)
+        finite = np.isfinite(actions).reshape(len(actions), -1).all(axis=1)
+        if not finite.all():
+            raise NonFiniteError(
+                f"the action of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of the "
+                "stage; nothing of this step was stored"
+            )
         return actions, stored
 
     def _on_action_grid(
@@ -471,7 +476,6 @@ class CFP(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        self._check_finite("reward", reward)
         new_obs = self._prepared(new_obs)
         for info in infos:
             if "terminal_observation" in info:
@@ -485,14 +489,6 @@ class CFP(SAC):
             next_obs = new_obs.index_copy(0, to_device(ended, self.device), to_device(finals, self.device))
         replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
         self._last_obs = new_obs
-
-    def _check_finite(self, name: str, values: np.ndarray) -> None:
-        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if not finite.all():
-            raise NonFiniteError(
-                f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
-                "the stage; nothing of this step was stored"
-            )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()

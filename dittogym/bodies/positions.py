@@ -170,8 +170,20 @@ class InitialPositions:
 
 
 def probe(body: BodySpec) -> np.ndarray:
-    """Points (n, 2), m, with which a body is measured."""
-    return body.shape.positions(sampling.sobol(PROBE, seed=0))
+    """Points (n, 2), m, with which a body is measured.
+
+    Raises:
+        ValueError: Its shape returns other arrays, or points outside its bounding box.
+    """
+    points, who = body.shape.positions(sampling.sobol(PROBE, seed=0)), f"positions of {type(body.shape).__name__}"
+    if np.shape(points) != (PROBE, 2):
+        raise ValueError(f"{who} must return (N, 2) for N points, here N = {PROBE}, got {np.shape(points)}")
+    low, high = _bounds(body)
+    near = 1e-9  # m, rounding
+    if not ((points > low - near) & (points < high + near)).all():
+        found = _box(points.min(0), points.max(0))
+        raise ValueError(f"{who} must lie in the box of its corner and size, {_box(low, high)}, got {found}")
+    return points
 
 
 def check_place(spec: TaskSpec) -> None:

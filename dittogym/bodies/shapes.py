@@ -129,7 +129,7 @@ class Figure:
         pixel: Side of a pixel, m.
 
     Raises:
-        ValueError: The mask has no pixel set, or a number is out of range.
+        ValueError: The mask has no pixel set, or none in an outer row or column, or a number is out of range.
     """
 
     mask: np.ndarray
@@ -144,6 +144,9 @@ class Figure:
         if not isinstance(mask, np.ndarray) or mask.ndim != 2 or mask.dtype != bool or not mask.any():
             found = f"{getattr(mask, 'dtype', type(mask).__name__)} of shape {np.shape(mask)}"
             raise ValueError(f"mask must be an array (rows, columns) of bool with a pixel set, got {found}")
+        if not all(edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1])):
+            found = f"{mask.shape[0]} rows and {mask.shape[1]} columns, of which an outer one is empty"
+            raise ValueError(f"mask must have pixels in its first and last row and column, got {found}")
 
     @property
     def size(self) -> tuple[float, float]:

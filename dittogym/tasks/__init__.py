@@ -64,6 +64,8 @@ def check_task(task: object) -> None:
                 importlib.import_module(module)
             except Exception as error:  # whatever the module does
                 reason = f" (module {module!r}: {type(error).__name__}: {error})"
+                if getattr(error, "name", None) == module:
+                    reason += ", neither in the working directory nor on the Python path"
             else:
                 reason = _registration_fault(task, module, name)
         if not reason and name in TASKS:

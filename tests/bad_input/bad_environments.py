@@ -134,6 +134,20 @@ class Tilted(Disc):
     tilt: float = 0.0
 
 
+class Spilling(Rectangle):
+    """A shape that is larger than it says."""
+
+    def positions(self, numbers):
+        return 2 * super().positions(numbers)
+
+
+class Lost(Rectangle):
+    """A shape that does not place all particles."""
+
+    def positions(self, numbers):
+        return super().positions(numbers)[::2]
+
+
 class OfTheGrid:
     """A policy that was trained in another layout."""
 
@@ -274,6 +288,9 @@ VALUES = [
     ("corner", lambda: Disc("home", 0.1)),
     ("draws", lambda: Rectangle((0, 0), (1, 1), draws=0)),
     ("mask", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1)),
+    ("mask", lambda: Figure(np.pad(np.ones((3, 3), bool), ((0, 1), (0, 0))), (0.4, 0.2), 0.1)),
+    ("positions of Spilling", lambda: body(Spilling((0.1, 0.2), (0.1, 0.1)))),
+    ("positions of Lost", lambda: body(Lost((0.1, 0.2), (0.1, 0.1)))),
     ("count", lambda: BodySpec(Disc((0.4, 0.2), 0.1), 0)),
     ("left and right", lambda: Box(0.5, 0.1)),
     *(("i must", lambda i=i: solid("box", i, (0, 9))) for i in (("a", "b"), (True, 9), (9, 0))),

@@ -265,7 +265,7 @@ def test_actor_that_has_diverged_does_not_act(spec):
 
 def test_reward_that_is_not_finite_is_never_stored():
     model = make_model(ActorSpec((8,)), FakeEnv(num_envs=2, horizon=9, faults={3: "reward"}))
-    with pytest.raises(NonFiniteError, match="reward of environment 0 is not finite at step 6"):
+    with pytest.raises(NonFiniteError, match="returned NaN or an infinite number for near"):
         model.learn(20)
     assert model.replay_buffer.size() == 2
     assert np.isfinite(model.replay_buffer.rewards).all()
