@@ -239,7 +239,7 @@ def draw_rewards() -> None:
         Line2D([], [], color=PAPER, lw=1, ls=":", label="paper's coarse policy"),
         Line2D([], [], color=ZERO, lw=1, label="zero actions"),
     ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles=entries, loc="outside upper center", ncols=4, frameon=False)
     save(figure, "rewards.svg")
 
 
