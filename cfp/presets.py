@@ -229,7 +229,7 @@ def _scaled_down(paper: SACConfig, name: str) -> SACConfig:
     horizon, many = dittogym.make_spec(task).horizon, task in MANY_UPDATES
     quick_steps, quick_handover = 48_000 if many else 38_400, 0.75
     # A longer run needs fewer evaluations and checkpoints a step, and as many steps of the critics alone. RUN gained
-    # nothing from more than 160,000 steps of the first stage, SHAPE MATCH little from more than 60,000.
+    # nothing from more than 160,000 steps of the first stage; the curves of SHAPE MATCH are flat before 60,000.
     long_steps, long_handover = 90_000 if task == "shapematch" else 240_000, 2 / 3
     steps = quick_steps if quick else long_steps
     coarse = paper.resolutions[0]
