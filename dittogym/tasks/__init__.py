@@ -63,9 +63,9 @@ def check_task(task: object) -> None:
             try:
                 importlib.import_module(module)
             except Exception as error:  # whatever the module does
-                reason = f" (module {module!r}: {type(error).__name__}: {error})"
-                if getattr(error, "name", None) == module:
-                    reason += ", neither in the working directory nor on the Python path"
+                absent = getattr(error, "name", None) == module
+                where = ", neither in the working directory nor on the Python path" if absent else ""
+                reason = f" (module {module!r}: {type(error).__name__}: {error}{where})"
             else:
                 reason = _registration_fault(task, module, name)
         if not reason and name in TASKS:
