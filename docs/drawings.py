@@ -213,17 +213,15 @@ def draw_returns() -> None:
 
 def draw_rewards() -> None:
     """Evaluations during long trainings from rewards, in thousands of steps and of the return."""
-    trainings: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    trainings: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for row in read("rewards-long.csv"):
         if not row["change"]:
             point = int(row["step"]) / 1000, int(row["mean"]) / 1000
-            trainings.setdefault((row["task"], row["seed"]), []).append(point)
-    tasks = [task for task in paper.CURVES if (task, "0") in trainings]
+            trainings.setdefault(row["task"], {}).setdefault(row["seed"], []).append(point)
     figure = Figure(figsize=(8.6, 4.2), layout="constrained")
-    for axes, task in zip(figure.subplots(2, 4).flat, tasks, strict=True):
-        for (of, _), points in trainings.items():
-            if of == task:
-                axes.plot(*zip(*points, strict=True), color=OURS, lw=1.2, marker=".", ms=4)
+    for axes, task in zip(figure.subplots(2, 4).flat, paper.CURVES, strict=True):
+        for points in trainings[task].values():
+            axes.plot(*zip(*points, strict=True), color=OURS, lw=1.2, marker=".", ms=4)
         zero = float(evaluated(task, "zero", UNDISTURBED, "lite")["mean"])
         axes.axhline(zero / 1000, color=ZERO, lw=1)
         axes.axhline(paper.CURVES[task][0][0] / 1000, color=PAPER, lw=1, ls="--")

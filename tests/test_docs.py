@@ -16,7 +16,6 @@ import drawings  # noqa: E402
 import media  # noqa: E402
 import tables  # noqa: E402
 
-import dittogym  # noqa: E402
 from torchmpm.native.cuda.compiler import digest_of_sources  # noqa: E402
 
 
@@ -73,7 +72,9 @@ def test_episodes_that_chose_a_policy_are_not_said_to_be_above_the_paper():
     assert tables.compared(row | {"task": "obstacle"}, 8650) == "9,000 ± 100"
 
 
-@pytest.mark.parametrize("name", ["returns.svg", "rewards.svg", *(f"tasks/{task}.png" for task in dittogym.TASKS)])
+@pytest.mark.parametrize(
+    "name", ["returns.svg", "rewards.svg", *(f"tasks/{task}.png" for task in drawings.dittogym.TASKS)]
+)
 def test_pictures_are_current(name):
     assert drawings.source(name).encode() in (DOCS / "images" / name).read_bytes(), "python docs/drawings.py draws them"
 

@@ -115,16 +115,17 @@ class TorchVecEnv(VecEnv):
         self._actions = None
         if not self._are_finite:  # on a GPU, which the step has waited for already
             raise NonFiniteError(DIVERGED)
-        if not np.isfinite(step.reward).all():
-            head = "reward_terms/"
-            raise reward_error({name.removeprefix(head): step.info[name] for name in step.info if head in name})
+        reward, head = step.reward.astype(np.float32), "reward_terms/"
+        if not np.isfinite(reward).all():
+            terms = {name.removeprefix(head): each for name, each in step.info.items() if name.startswith(head)}
+            raise reward_error(terms)
         if self._limits is not None:
             self._limits[step.done] = self.max_episode_steps
         infos = _split(step.info)
         for index, image in step.finals.items():
             infos[index]["terminal_observation"] = image
             infos[index]["TimeLimit.truncated"] = bool(step.truncated[index])
-        return self._as_returned(step.observation), step.reward.astype(np.float32), step.done, infos
+        return self._as_returned(step.observation), reward, step.done, infos
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""

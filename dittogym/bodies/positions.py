@@ -179,7 +179,7 @@ def probe(body: BodySpec) -> np.ndarray:
     if np.shape(points) != (PROBE, 2):
         raise ValueError(f"{who} must return (N, 2) for N points, here N = {PROBE}, got {np.shape(points)}")
     low, high = _bounds(body)
-    near = 1e-9  # m, rounding
+    near = 1e-6  # m, more than single precision rounds
     if not ((points > low - near) & (points < high + near)).all():
         found = _box(points.min(0), points.max(0))
         raise ValueError(f"{who} must lie in the box of its corner and size, {_box(low, high)}, got {found}")
