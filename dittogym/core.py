@@ -432,6 +432,8 @@ def check_rewards(model: Model, positions: Tensor) -> None:
         if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
             found = f"{_kind(value)} for {name!r}"
             raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {found}")
+        if not value.isfinite().all():
+            raise ValueError(f"{who} must return finite terms, got {value.tolist()} for {name!r} at the start")
     for name, flag in (("terminated", reward.terminated), ("success", reward.success)):
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
             raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")

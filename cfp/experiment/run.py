@@ -51,7 +51,7 @@ def check_options(config: RunConfig) -> None:
     config.check()
     check_wandb(config)
     for stage in range(1, len(config.ends()) + 1):
-        make_env(config, config.action_size(stage), 1)
+        make_env(config, config.action_size(stage), 1, conditions=config.conditions(stage))
     if config.for_training() != config:
         try:
             make_env(config.for_training(), config.action_size(1), 1)
@@ -153,7 +153,8 @@ class TrainingRun:
                 del learner
                 gc.collect()  # callbacks refer to it; its replay memory would be there beside the next one
         except NonFiniteError as error:
-            raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
+            kept = "the last checkpoint is untouched" if self.checkpoint.path.exists() else "there is no checkpoint yet"
+            raise NonFiniteError(f"{error}; {kept}") from error
         finally:
             self.logger.close()
 

@@ -320,6 +320,7 @@ VALUES = [
     ("weights", lambda: returned({"heigth": 7.0})),
     ("weights", lambda: returned({"height": 7.0, "alve": 1.0})),
     ("'height'", lambda: returned(terms={"height": torch.zeros(3)})),
+    ("finite terms", lambda: returned(terms={"height": torch.tensor([1.0, torch.nan])})),
     ("terms", lambda: returned(terms={"alive": torch.zeros(2)})),
     ("terminated", lambda: returned(terminated=torch.zeros(2, 2, dtype=torch.bool))),
     ("success", lambda: returned(success=torch.zeros(2))),

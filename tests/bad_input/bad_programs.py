@@ -138,6 +138,7 @@ OTHERS = (
         ("--algo shac --num-layouts 50000", "num_layouts must be at most"),
         *((f"--algo {algo} --resample", "resample must be False") for algo in SEEDED),
         ("--algo cfp-analytic --vary-latency 3", "vary_latency requires vary"),
+        ("--task grow --vary 0.5 --vary-start 20 --dry-run", "conditions must leave the robot room"),
         ("--algo distill --teacher run --task run --learning-rate 0.01", "learning_rate requires teacher mpc"),
         ("--algo distill --planner-grid 4", "planner_grid requires teacher mpc"),
     )

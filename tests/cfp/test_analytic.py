@@ -62,7 +62,8 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path)
 
 
 def undefined(transition, spec):
-    return Reward({"far": (transition.start.com[:, 1] - transition.now.com[:, 1] - 1.0).sqrt()})  # of a negative number
+    moved = (transition.now.com[:, 1] - transition.start.com[:, 1]).square()
+    return Reward({"far": (-moved).sqrt()})  # NaN once the robot has moved
 
 
 def test_a_reward_that_is_not_finite_ends_the_training(monkeypatch, tmp_path):

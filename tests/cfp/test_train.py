@@ -210,11 +210,14 @@ def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder
     assert "the run is finished, but its checkpoint is missing" in capsys.readouterr().err
 
 
-def test_a_training_that_diverges_says_that_its_checkpoint_is_whole(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("step", "says"), [(50, "the last checkpoint is untouched"), (10, "there is no checkpoint yet")]
+)
+def test_a_training_that_diverges_says_whether_a_checkpoint_is_left(tmp_path, capsys, step, says):
     folder, on_step = tmp_path / "run", callbacks.StopCallback._on_step
 
     def act(callback):
-        if callback.stage.step == 50:
+        if callback.stage.step == step:
             next(callback.stage.learner.policy.actor.parameters()).data.fill_(torch.nan)
         return on_step(callback)
 
@@ -222,10 +225,13 @@ def test_a_training_that_diverges_says_that_its_checkpoint_is_whole(tmp_path, ca
         patch.setattr(callbacks.StopCallback, "_on_step", act)
         assert run(folder) == 1
     error = capsys.readouterr().err  # without a bar, which is for long trainings where there is no terminal
-    assert error.startswith("error: ") and error.endswith("; the last checkpoint is untouched\n")
-    state = Checkpoint(folder / "checkpoint").read()
-    assert state["num_timesteps"] == 40
-    assert all(bool(weights.isfinite().all()) for weights in state["learner"]["policy"].values())
+    assert error.startswith("error: ") and error.endswith(f"; {says}\n")
+    checkpoint = Checkpoint(folder / "checkpoint")
+    if step == 50:
+        state = checkpoint.read()
+        assert state["num_timesteps"] == 40
+        assert all(bool(weights.isfinite().all()) for weights in state["learner"]["policy"].values())
+    assert checkpoint.path.exists() == (step == 50)
 
 
 @contextmanager
