@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cfp.agent.features import ImageFeatures
     from cfp.analytic.learner import CFPAnalytic
     from cfp.envs.vec_env import TorchVecEnv
+    from cfp.evaluation.returns import evaluate_policy
     from cfp.runs import Run, fit
     from cfp.sac.learner import CFP
     from cfp.sac.policies import CFPPolicy
@@ -34,6 +35,7 @@ __all__ = [
     "Run",
     "SACConfig",
     "TorchVecEnv",
+    "evaluate_policy",
     "fit",
     "load",
     "preset",
@@ -46,6 +48,7 @@ _ON_FIRST_USE = {
     "CFPPolicy": "cfp.sac.policies",
     "ImageFeatures": "cfp.agent.features",
     "Run": "cfp.runs",
+    "evaluate_policy": "cfp.evaluation.returns",
     "fit": "cfp.runs",
     "TorchVecEnv": "cfp.envs.vec_env",
 }

@@ -619,6 +619,8 @@ def update_from_dict(base: Value, values: Any) -> Value:
             raise ConfigError(f"{name} is not an option; options are {', '.join(names)}")
         hint, value = hints[name], tuple(value) if isinstance(value, list) else value
         parts = value if isinstance(value, tuple) else (value,)
+        if typing.get_args(hint)[1:] == (...,):  # one value for all stages
+            value = parts
         try:
             if hint is not bool and any(isinstance(part, bool) for part in parts):  # which Python takes for numbers
                 raise TypeCheckError("is a truth value")

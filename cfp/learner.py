@@ -30,7 +30,6 @@ from cfp.policy import (
     KIND,
     ActorPolicy,
     Policy,
-    attached,
     copy_policy,
     load,
     policy_for,
@@ -39,6 +38,7 @@ from cfp.policy import (
     write_policy,
 )
 from dittogym import TorchEnv
+from dittogym.render.recording import attached
 
 #: What a policy may look at: the observation; the full state; the simulator, to plan with; nothing.
 Sees = Literal["image", "state", "simulator", "nothing"]

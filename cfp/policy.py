@@ -27,7 +27,7 @@ from cfp.config import LARGEST_SEED, TASK_OPTIONS, EnvironmentConfig, RunConfig,
 from cfp.errors import CheckpointError, ConfigError, brief
 from cfp.files import write_atomically, write_json
 from cfp.hub import Shareable, download, is_address
-from dittogym import TorchEnv, make_spec
+from dittogym import make_spec
 from dittogym.action import trained_layout
 from dittogym.geometry import NODES
 from dittogym.observation import SHAPE
@@ -86,11 +86,6 @@ class Policy(Protocol):
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Memory]:
         """Choose actions, see `ActorPolicy.predict`."""
-
-
-def attached(policy: Any, env: TorchEnv) -> Any:
-    """A policy for an environment: one that acts on the state of the simulation is shown that of ``env``."""
-    return policy.attached(env) if hasattr(policy, "attached") else policy
 
 
 def check_images(observation: object) -> None:
@@ -262,7 +257,8 @@ def policy_file(path: str | Path) -> Path:
     if not file.exists() and (SHIPPED / f"{path}.safetensors").exists():
         file = SHIPPED / f"{path}.safetensors"
     if not file.exists():
-        raise CheckpointError(f"{file}: there is no policy, and no shipped one has that name ({', '.join(shipped())})")
+        also = f"no shipped one has that name ({', '.join(shipped())})"
+        raise CheckpointError(f"{path}: there is no policy (a file .safetensors), and {also}")
     return file
 
 

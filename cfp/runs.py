@@ -70,7 +70,7 @@ class Run:
         return rows
 
     def film(self, path: str | os.PathLike[str] | None = None, **options: Any) -> Recording:
-        """Record one episode of the policy, which a notebook shows.
+        """Record the first episode of the policy's evaluation, which a notebook shows.
 
         Args:
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.

@@ -232,7 +232,7 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
 
     def acting(self, policy: Any) -> Act:
         """A policy of one robot, see :meth:`film`, as a function that the batch of one can be driven by."""
-        act = as_function(policy, self.torch_env.action_layout)
+        act = as_function(policy, self.torch_env)
         return lambda images: as_tensor(act(images[0]), self.torch_env, single=True)
 
     def _repr_png_(self) -> bytes | None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dittogym.core import EnvState, Model
 from dittogym.rewards import Features
+from torchmpm import tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,10 @@ class Snapshot:
     state: EnvState
     observation: Tensor
     constants: Mapping[str, str]
+
+    def __getitem__(self, index: int) -> Snapshot:
+        """That of one simulation of the batch, which can be loaded into all elements of another."""
+        return Snapshot(tree.map(lambda value: value[[index]], self.state), self.observation[[index]], self.constants)
 
     def __repr__(self) -> str:
         """Task and state; the rest would fill pages."""

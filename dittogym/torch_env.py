@@ -474,7 +474,7 @@ class TorchEnv:
             ValueError: An option is out of range, the file does not take it, or the policy has another layout.
             TypeError: The policy is neither a function nor has a method ``predict``.
         """
-        return film(self, as_function(policy, self.action_layout), path, seed, index, **options)
+        return film(self, as_function(policy, self), path, seed, index, **options)
 
     def _repr_png_(self) -> bytes | None:
         """What a notebook shows once there is a state: all simulations, row by row."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from dittogym.bodies.positions import MAX_SEED
 from dittogym.env import Env
@@ -60,27 +61,29 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
     """Reset an environment, play an episode, and record it as arrays.
 
     Args:
-        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package. Its wrappers
-            have no part in it.
+        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package without
+            wrappers of your own, which would have no part in it.
         policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
         seed: Seed of the reset and of the policy's noise.
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
 
     Raises:
         TypeError: The environment, the policy or ``fields`` is of another kind.
-        ValueError: The environment has more than one simulation, or there is no such field.
+        ValueError: The environment has more than one simulation, or wrappers, or there is no such field.
     """
     seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
     torch_env = inner.torch_env if isinstance(inner, Env) else inner
     if not isinstance(torch_env, TorchEnv):
         raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
+    if isinstance(env, gymnasium.Env) and (ignored := _changes(env, torch_env.spec.horizon)):
+        raise ValueError(f"env must have no wrappers, which have no part in a recording, got {ignored}: env.unwrapped")
     if torch_env.num_envs != 1:
         raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
     checks.instances("fields", fields, str)
     if unknown := [name for name in fields if name not in FIELDS]:
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
-    act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env.action_layout)
+    act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env)
     observations, actions, ends, states = [], [], [], []
     for images, chosen, end in play(torch_env, act, seed):
         observations.append(images.copy())
@@ -216,6 +219,16 @@ def load_minari(dataset_id: str) -> list[Episode]:
         )
         for episode, seed in zip(dataset.iterate_episodes(), seeds, strict=True)
     ]
+
+
+def _changes(env: gymnasium.Env[Any, Any], horizon: int) -> gymnasium.Wrapper[Any, Any, Any, Any] | None:
+    """The outermost wrapper of an environment that ``gymnasium.make`` without options does not put around it."""
+    while isinstance(env, gymnasium.Wrapper):
+        limit = env.spec.max_episode_steps if isinstance(env, TimeLimit) and env.spec else None
+        if not isinstance(env, PassiveEnvChecker | OrderEnforcing) and limit != horizon:
+            return env
+        env = env.env
+    return None
 
 
 def _check(episodes: Sequence[Episode]) -> None:

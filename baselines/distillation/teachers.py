@@ -13,10 +13,11 @@ from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
 from cfp.config import EnvironmentConfig
-from cfp.policy import Policy, attached, check_trained_for, read_policy
+from cfp.policy import Policy, check_trained_for, read_policy
 from cfp.resumable import Resumable
 from dittogym import TorchEnv
 from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_grid_layout, trained_layout
+from dittogym.render.recording import attached
 
 
 class Teacher(Resumable, ABC):

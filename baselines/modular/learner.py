@@ -128,7 +128,7 @@ class Modular(SACLearner):
         """The learner at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
-        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.max_episode_steps))
+        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.max_episode_steps, stagger=True))
         return cast(Modular, cls.make(config, stage, folder, monitor, ModularPolicy, networks))
 
     @property

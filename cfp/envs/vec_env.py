@@ -34,13 +34,15 @@ class TorchVecEnv(VecEnv):
         env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
         spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
         max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
-            After a reset of all elements, the first episode of element i is truncated after a fraction
-            ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
         tensors: Observations are tensors on the device, and so may actions be: of a GPU only numbers, and the last
             images of episodes, are copied to the host.
+        stagger: For training, with ``max_episode_steps``: after a reset of all elements, the first episode of element i
+            is truncated after a fraction ``(i + 1) / B`` of these steps already, so that a batch always holds
+            beginnings and ends of episodes.
 
     Raises:
         ValueError: ``max_episode_steps`` is no whole number from 1.
+        TypeError: ``env`` is a Gymnasium environment.
     """
 
     def __init__(
@@ -49,8 +51,11 @@ class TorchVecEnv(VecEnv):
         spaces: tuple[Space[Any], Space[Any]] | None = None,
         max_episode_steps: int | None = None,
         tensors: bool = False,
+        stagger: bool = False,
     ) -> None:
-        self.torch_env, self.tensors = env, tensors
+        if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv):
+            raise TypeError(f"env must be a TorchEnv, such as env.unwrapped.torch_env, got {env!r}")
+        self.torch_env, self.tensors, self.stagger = env, tensors, stagger
         if max_episode_steps is not None:  # -1 would end every episode in its first step
             max_episode_steps = min(checks.whole("max_episode_steps", max_episode_steps, 1), env.spec.horizon)
         self.max_episode_steps = max_episode_steps
@@ -62,7 +67,11 @@ class TorchVecEnv(VecEnv):
 
     def _first_limits(self) -> np.ndarray | None:
         limit = self.max_episode_steps
-        return None if limit is None else first_limits(self.num_envs, limit, torch.device("cpu")).numpy()
+        if limit is None:
+            return None
+        if not self.stagger:
+            return np.full(self.num_envs, limit)
+        return first_limits(self.num_envs, limit, torch.device("cpu")).numpy()
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
@@ -211,5 +220,5 @@ def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
 
 
 def monitored(env: Any, max_episode_steps: int | None = None, tensors: bool = False) -> VecMonitor:
-    """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
-    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps, tensors=tensors))
+    """Wrap an environment for training; adds return and length as ``info["episode"]``."""
+    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps, tensors=tensors, stagger=True))

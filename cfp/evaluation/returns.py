@@ -26,12 +26,14 @@ from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import DIVERGED, reward_error
 from cfp.errors import NonFiniteError
 from cfp.messages import progress_bar
-from cfp.policy import Memory, Observation, Policy, Start, attached
+from cfp.policy import Memory, Observation, Policy, Start
 from dittogym import Conditions, TorchEnv
 from dittogym.copies import to_device, to_host
 from dittogym.env import as_numpy
 from dittogym.pieces import largest_piece
-from dittogym.render.recording import seed_noise
+from dittogym.render.recording import attached, seed_noise
+from dittogym.spec import TaskSpec
+from torchmpm import checks
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
@@ -355,6 +357,55 @@ def evaluate(
             torch.set_num_threads(threads)
     played = (episode for future in futures for episode in future.result())
     return [Result(trial.name, trial.resolution, tuple(islice(played, trial.episodes))) for trial in trials]
+
+
+def evaluate_policy(
+    policy: PolicyPredictor,
+    task: str | TaskSpec,
+    episodes: int = 20,
+    *,
+    seed: int = 2 * EVALUATION_SEED,
+    deterministic: bool = False,
+    **options: Any,
+) -> Result:
+    """Evaluate any policy as those of this package are: return, success, and mass in one piece.
+
+    The result is the same, to the last bit, whatever the number of cores.
+
+    Args:
+        policy: A policy of this package, a model of stable-baselines3, or another object with its ``predict``, which
+            gets images (B, 3, 64, 64) uint8 and returns actions (B, 2, R, R), and its memory, or ``None``.
+        task: A task of `dittogym`, also ``"MODULE:NAME"``, or a specification.
+        episodes: Number of episodes.
+        seed: Of the first episode; the next ones have the seeds after it. With the default value they start from
+            positions on which nothing was trained here.
+        deterministic: Act without noise.
+        options: Of the environment, such as ``particles`` and ``conditions``, see `dittogym.TorchEnv`; ``resolution``
+            is that of the policy if it has one.
+
+    Raises:
+        ValueError: An argument is out of range, or an action has another shape.
+        NonFiniteError: An action or a reward is NaN or infinite.
+
+    Examples:
+        >>> import cfp, dittogym
+        >>> late = dittogym.Conditions(latency=1)
+        >>> result = cfp.evaluate_policy(cfp.load("shapematch"), "shapematch", 2, particles="lite", conditions=late)
+        >>> len(result.returns), result.mean > 300
+        (2, True)
+    """
+    checks.whole("episodes", episodes, 1)
+    checks.whole("seed", seed, 0)
+    if hasattr(policy, "resolution"):
+        options = {"resolution": policy.resolution} | options
+
+    def make_env(count: int) -> TorchEnv:
+        return TorchEnv(task, count, **options)
+
+    env = make_env(1)  # refuses options before threads begin, and knows the horizon
+    together = env.device.type != "cpu"
+    trial = Trial("policy", env.action_resolution, policy, make_env, episodes, deterministic, seed, together)
+    return evaluate([trial], env.spec.horizon)[0]
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:

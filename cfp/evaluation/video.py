@@ -13,10 +13,10 @@ from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.evaluation.returns import Noise, SeededPolicy, evaluation_seed, without_noise
 from cfp.messages import say
-from cfp.policy import Policy, attached
+from cfp.policy import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
-from dittogym.render.recording import OPTIONS, Act, FilmOptions, Recording, record
+from dittogym.render.recording import OPTIONS, Act, FilmOptions, Recording, attached, record
 
 Recorded = TypeVar("Recorded")
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from cfp.play import protocol
 from cfp.play.hand import Direction, Grip, press, reach, wave
-from cfp.policy import attached
 from dittogym.action import bicubic, from_grid_layout, patch_corner, to_grid_layout, trained_layout
 from dittogym.bodies.drawings import with_body
 from dittogym.bodies.positions import probe
@@ -25,7 +24,7 @@ from dittogym.bodies.shapes import Figure
 from dittogym.core import check_stability
 from dittogym.geometry import NODES, centre_in_window
 from dittogym.physics import check_effect, physics_values
-from dittogym.render.recording import Recording
+from dittogym.render.recording import Recording, attached
 from dittogym.render.scene import Shot, describe
 from dittogym.snapshots import Snapshot
 from dittogym.spec import BodySpec

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from html import escape
 from itertools import islice
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from dittogym.action import ActionLayout, trained_layout
+from dittogym.action import trained_layout
 from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
 from dittogym.render.frame import frame, pace, written_return
@@ -208,6 +208,8 @@ def check_path(path: str | os.PathLike[str]) -> Path:
 
 def check_film(path: Any, options: Mapping[str, Any]) -> None:
     """Check the arguments of :meth:`Recording.save` for a single file, of which none may be without effect."""
+    if unknown := options.keys() - (names := [option.name for option in fields(FilmOptions)]):
+        raise TypeError(f"options of a film must be among {', '.join(names)}, got {sorted(unknown)}")
     FilmOptions(**options)
     if path is None:
         if options:
@@ -296,21 +298,28 @@ def seed_noise(seed: int, step: int) -> None:
         torch.cuda.manual_seed_all(number)
 
 
-def as_function(policy: Any, layout: ActionLayout) -> Act:
+def attached(policy: Any, env: Any) -> Any:
+    """A policy for an environment: one that acts on the state of the simulation is shown that of ``env``."""
+    return policy.attached(env) if hasattr(policy, "attached") else policy
+
+
+def as_function(policy: Any, env: Any) -> Act:
     """A policy as a function of observations.
 
     Args:
         policy: A function, or an object with ``predict(observation, state)`` as stable-baselines3's, which returns
             actions and the next state. If its ``deterministic_by_default`` is true, it is also given
             ``deterministic=True``.
-        layout: ``action_layout`` of the environment.
+        env: The :class:`dittogym.TorchEnv` in which it acts.
 
     Raises:
         TypeError: It is neither.
         ValueError: It was trained with another ``action_layout``.
     """
-    if (trained := trained_layout(policy)) not in (None, layout):
-        raise ValueError(f"policy must be one for action_layout {layout!r} of the environment, got one for {trained!r}")
+    if (trained := trained_layout(policy)) not in (None, env.action_layout):
+        allowed = f"action_layout {env.action_layout!r} of the environment"
+        raise ValueError(f"policy must be one for {allowed}, got one for {trained!r}")
+    policy = attached(policy, env)
     if not hasattr(policy, "predict"):
         if not callable(policy):
             raise TypeError(f"policy must be a function or have a method predict, got {type(policy).__name__}")

@@ -32,6 +32,7 @@ for iteration in range(2):
             action = distribution.sample()
             clipped = action.clamp(-1, 1).view(NUM_ENVS, *env.action_shape)
             following, reward, terminated, truncated, _ = env.step(clipped)
+            reward = reward + DISCOUNT * (truncated & ~terminated) * evaluate(following)[1]  # a time limit is no end
         ended = terminated | truncated
         steps.append((observation, action, distribution.log_prob(action).sum(1), estimate, reward, ended))
         observation = env.reset(options={"reset_mask": ended})[0] if ended.any() else following

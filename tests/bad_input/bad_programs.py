@@ -75,7 +75,7 @@ TRAIN = [
         ("--backend warp", "backend must be one of", "'warp'"),
         ("--target none.png", "target must be 'star'", "'none.png'"),
         ("--variant published", "'shapematch'", "'variant'"),
-        ("--start-from none", "none.safetensors: there is no policy"),
+        ("--start-from none", "none: there is no policy"),
         ("--start-from run", "start_from must be a policy for shapematch"),
         ("--out /proc/run", "out: /proc/run cannot be created as a folder"),
         ("--out run\udcff", "out must be text in UTF-8"),
@@ -194,7 +194,7 @@ OTHERS = (
     )
     + rows(
         "rank",
-        ("none", "none.safetensors: there is no policy"),
+        ("none", "none: there is no policy"),
         ("none.json", "none.json: cannot be read as JSON"),
     )
     + [

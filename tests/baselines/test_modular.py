@@ -29,7 +29,7 @@ from baselines.modular.segments import (
 from baselines.registry import configure, find
 from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import describe_run
-from dittogym import TorchEnv
+from dittogym import Env, TorchEnv
 from dittogym.action import from_grid_layout, place, to_grid_layout
 from dittogym.geometry import centre_in_window
 
@@ -291,6 +291,8 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
     policy = untrained()
     with pytest.raises(RuntimeError, match="attached"):
         policy.predict(np.zeros((1, 3, 64, 64), np.uint8))
+    run = Env("run", resolution=64, particles=100, substeps=1)  # films show it the state by themselves
+    assert len(run.film(policy, max_steps=2).rewards) == 2
     env = TorchEnv("catch", 1, 64, particles=(100, 20))
     with pytest.raises(ValueError, match="10 features, got 'catch' with 16"):
         policy.attached(env)

@@ -20,9 +20,10 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.callbacks import EvaluationCallback
-from cfp.policy import attached, describe_run, read_policy
+from cfp.policy import describe_run, read_policy
 from cfp.presets import sac_preset
 from cfp.tables import read_table
+from dittogym.render.recording import attached
 
 pytestmark = pytest.mark.usefixtures("short")
 

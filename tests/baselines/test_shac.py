@@ -16,8 +16,9 @@ from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env, make_torch_env
 from cfp.errors import CheckpointError, NonFiniteError
 from cfp.evaluation.returns import evaluate, make_trial
-from cfp.policy import attached, describe_run
+from cfp.policy import describe_run
 from dittogym import Env, TorchEnv
+from dittogym.render.recording import attached
 
 
 def options(task="run", **changes):

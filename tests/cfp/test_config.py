@@ -90,8 +90,10 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
 
 
 def test_json_values_take_the_types_of_their_fields():
-    config = update_from_dict(sac_preset("shapematch"), {"alpha": [1, 0], "particles": [500, 20], "dt": 1})
-    assert (config.alpha, config.particles, config.target) == ((1, 0), (500, 20), None)
+    config = update_from_dict(
+        sac_preset("shapematch"), {"alpha": [1, 0], "particles": [500, 20], "dt": 1, "resolutions": 8}
+    )
+    assert (config.alpha, config.particles, config.target, config.resolutions) == ((1, 0), (500, 20), None, (8,))
     assert isinstance(config.dt, float)
 
 

@@ -9,6 +9,8 @@ import pytest
 import torch
 from fakes import FakeEnv
 
+import cfp
+import dittogym
 from cfp import messages
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluate import Command
@@ -177,3 +179,25 @@ def test_the_headline_of_a_task_with_small_returns_tells_them_apart():
         for name, total in (("zero action", -0.04), ("stage 1", 2.87))
     ]
     assert headline(preset("run"), results).endswith("return 2.9 (zero action 0.0)")
+
+
+def test_any_policy_is_evaluated_as_those_of_the_package():
+    class Waves:
+        """Has memory, and noise from torch's generator."""
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            count = 0 if state is None else state
+            noise = 0 if deterministic else torch.rand(len(observation), 2, 4, 4).numpy()
+            return np.full((len(observation), 2, 4, 4), np.sin(count), np.float32) + 0.1 * noise, count + 1
+
+    options = {"particles": 100, "substeps": 1, "resolution": 4}
+    result = cfp.evaluate_policy(Waves(), "shapematch", 3, seed=5, **options)
+    assert len(result.returns) == 3 and result.success == 0 and result.interval > 0
+    assert (
+        cfp.evaluate_policy(Waves(), dittogym.make_spec("shapematch"), 1, seed=7, **options).mean == result.returns[2]
+    )
+    deterministic = cfp.evaluate_policy(Waves(), "shapematch", 3, seed=5, deterministic=True, **options)
+    late = cfp.evaluate_policy(Waves(), "shapematch", 3, seed=5, conditions=Conditions(latency=2), **options)
+    assert len({result.returns, deterministic.returns, late.returns}) == 3
+    policy = cfp.load("shapematch")
+    assert cfp.evaluate_policy(policy, "shapematch", 1, particles=100, substeps=1).resolution == policy.resolution

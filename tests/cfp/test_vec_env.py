@@ -37,15 +37,18 @@ def test_first_episodes_are_truncated_at_different_ages_and_a_state_continues_th
                 assert infos[i]["TimeLimit.truncated"]
         return ended
 
-    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6)
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6, stagger=True)
     env.reset()
     assert lengths(env, 20) == [[2, 8, 14], [5, 11, 17]]
     env.reset()
     lengths(env, 4)
-    other = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6)
+    other = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6, stagger=True)
     other.reset()
     other.load_state_dict(env.state_dict())
     assert lengths(other, 10) == lengths(env, 10) == [[4], [1, 7]]
+    plain = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6)
+    plain.reset()
+    assert lengths(plain, 20) == [[5, 11, 17]] * 2
     with pytest.raises(ValueError, match="state must hold tensors of shapes"):
         TorchVecEnv(FakeEnv(num_envs=3), max_episode_steps=6).load_state_dict(env.state_dict())
 
@@ -53,7 +56,7 @@ def test_first_episodes_are_truncated_at_different_ages_and_a_state_continues_th
 def test_episodes_are_never_longer_than_the_horizon():
     env = TorchVecEnv(FakeEnv(num_envs=2, horizon=6), max_episode_steps=10)
     env.reset()
-    ends = [step for step in range(13) if env.step(actions(env))[2][1]]
+    ends = [step for step in range(13) if env.step(actions(env))[2].all()]
     assert ends == [5, 11]
 
 

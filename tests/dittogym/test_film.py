@@ -221,11 +221,11 @@ def test_policies_are_functions_or_predict() -> None:
         def predict(self, observation, state=None, episode_start=None, deterministic=False):
             return (deterministic, state), (state or 0) + 1
 
-    policy = Telling()
-    act = as_function(policy, "image")
+    policy, env = Telling(), dittogym.TorchEnv("kick", **SMALL)
+    act = as_function(policy, env)
     assert [act(None), act(None)] == [(False, None), (False, 1)]
     policy.deterministic_by_default = True
-    assert as_function(policy, "image")(None) == (True, None)
+    assert as_function(policy, env)(None) == (True, None)
 
 
 def decode(page: str) -> tuple[dict, np.ndarray, dict[str, np.ndarray]]:

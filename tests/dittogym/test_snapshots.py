@@ -90,6 +90,21 @@ def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
 
 
 @torch.no_grad()
+def test_one_simulation_of_a_snapshot_goes_on_everywhere() -> None:
+    batch = tiny("slot", 3)
+    batch.reset(seed=0)
+    stir(batch)
+    moment, drive = batch.save(), actions(batch, STEPS)
+    future = go_on(batch, drive)
+    batch.load(moment[-1])
+    repeated = go_on(batch, drive[:, 2:].expand_as(drive))
+    for (result, _), (again, _) in zip(future, repeated, strict=True):
+        assert all(torch.equal(image, result[0][2]) for image in again[0])
+    with pytest.raises(IndexError):
+        moment[3]
+
+
+@torch.no_grad()
 def test_one_moment_into_every_element() -> None:
     """Branches: what every element does is what the single simulation would have done with its actions."""
     single, batch = tiny("slot"), tiny("slot", 3)

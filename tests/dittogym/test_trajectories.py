@@ -55,6 +55,14 @@ def test_episode_is_what_the_environment_did(env, episodes):
     assert np.array_equal(observation, episode.observations[30]) and episode.particles["x"].shape == (31, 100, 2)
 
 
+def test_wrappers_that_would_be_ignored_are_refused():
+    halved = gymnasium.wrappers.TransformReward(gymnasium.make(ID, **OPTIONS), lambda reward: reward / 2)
+    for env in (halved, gymnasium.make(ID, max_episode_steps=10, **OPTIONS)):
+        with pytest.raises(ValueError, match="env must have no wrappers"):
+            trajectories.record(env, noise())
+        assert len(trajectories.record(env.unwrapped, noise()).rewards) == 30
+
+
 def test_batch_of_one_records_the_same(episodes):
     batch = dittogym.TorchEnv("shapematch", **OPTIONS)
     again = trajectories.record(batch, noise(7), seed=7)
