@@ -1,4 +1,4 @@
-"""Balances of a simulation: mass, momentum and energy.
+"""What is in the window, and balances of a simulation: mass, momentum and energy.
 
 All functions raise a TypeError for anything but a solver and a state, and a ValueError for a state with another number
 of particles than the solver's bodies.
@@ -14,6 +14,13 @@ from torchmpm.materials.body import per_particle, slices
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
 from torchmpm.substep import free_velocity, grid_velocity, particles_to_grid
+
+
+def inside(solver: Solver, state: ParticleState, origin: Tensor | None = None) -> Tensor:
+    """Which particles are in the window, whose lower left corner is at ``origin`` (B, 2), m, and move; (B, N) bool."""
+    _check(solver, state)
+    at = state.x.new_zeros(state.batch_size, 2) if origin is None else origin
+    return solver.grid.takes_part(state.x[..., 0], state.x[..., 1], at)
 
 
 def masses(solver: Solver, state: ParticleState) -> Tensor:

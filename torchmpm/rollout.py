@@ -33,7 +33,8 @@ def repeated(
             the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
             forward pass. ``None``, and any value under ``torch.func``, keeps the whole graph; ``"auto"`` is 10.
         shared: A tree of all tensors that ``step`` reads besides the state. Without it ``step`` may read any tensors,
-            and checkpoints take about twice as long.
+            and checkpoints take about twice as long, or many times as long, and more memory than none, if it calls
+            ``torch.autograd.grad``.
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.

@@ -29,6 +29,14 @@ def test_mass_and_momentum(state: ParticleState) -> None:
     torch.testing.assert_close(diagnostics.momentum(SOLVER, state), expected)
 
 
+def test_what_is_outside_the_window_does_not_move(state: ParticleState) -> None:
+    origin = torch.stack((torch.zeros(2, dtype=torch.float64), state.x[1].mean(0)))
+    inside = diagnostics.inside(SOLVER, state, origin)
+    moved = (SOLVER.step(state, substeps=2, origin=origin).x != state.x).any(-1)
+    assert torch.equal(inside, moved) and inside[0].all() and 0 < inside[1].sum() < N
+    assert torch.equal(diagnostics.inside(SOLVER, state)[0], inside[0])
+
+
 def test_angular_momentum_of_a_rigid_rotation() -> None:
     """Of a lattice about the origin: inertia times angular velocity, where a particle has m (r^2 + h^2 / 2)."""
     state = lively(N)
