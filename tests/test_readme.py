@@ -78,6 +78,7 @@ PAGES = {
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
         "assert net[0].weight.grad.abs().max() > 0 and friction.grad < 0",
+        "assert (slid.x - start.x)[..., 0].mean() < -0.005 and angle.grad < 0",
         "assert policy.actions.shape == (30, 2, 32, 32) and (folder / 'index.html').exists()",
     ),
 }

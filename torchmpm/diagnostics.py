@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchmpm import checks
-from torchmpm.boundary import constrain
 from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import per_particle, slices
 from torchmpm.solver import Solver
@@ -89,7 +88,7 @@ def impulses(
     scene = solver.scene(state, actuation, solver.check_arguments(state, actuation, origin))
     momentum = particles_to_grid(scene, state.components()).momentum
     before, damped = free_velocity(scene, momentum), grid_velocity(scene, momentum)
-    accelerated, after = before + scene.gravity, constrain(scene.faces, damped)
+    accelerated, after = before + scene.gravity, solver.boundary(scene, damped)
     stages = {"gravity": (before, accelerated), "damping": (accelerated, damped), "boundary": (damped, after)}
     return {name: (momentum[0] * (new - old)).sum(-1).T for name, (old, new) in stages.items()}
 

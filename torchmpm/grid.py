@@ -61,6 +61,12 @@ class Grid:
         """Distance from the origin at which particles leave the window to the right, m; to the left: the margin."""
         return self.resolution * self.h - self.margin
 
+    def nodes(self, origin: Tensor) -> Tensor:
+        """Where the nodes of a window at ``origin`` (B, 2), m, are, with those of the padding, (2, B, cells), m."""
+        along = torch.arange(-PAD, self.resolution + PAD).to(origin) * self.h
+        x, y = torch.meshgrid(along, along, indexing="ij")
+        return torch.stack((x.flatten(), y.flatten()))[:, None] + origin.T[..., None]
+
     def node_shift(self, origin: Tensor) -> Tensor:
         """Whole nodes between the world's origin and a window's at (B, 2), m, truncated towards zero, (B, 2) int64."""
         nodes = origin.detach() * (1.0 / self.h)

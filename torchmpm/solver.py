@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
 from torchmpm.backends import BACKENDS, warn_eager
-from torchmpm.boundary import VelocityRule, faces
+from torchmpm.boundary import VelocityRule, constrain, faces
 from torchmpm.checks import Segment
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value, lame, try_law
@@ -25,7 +25,7 @@ from torchmpm.native.tables import KINDS
 from torchmpm.rollout import repeated
 from torchmpm.sampling import disc, sobol
 from torchmpm.state import ParticleState
-from torchmpm.substep import Components, Scene, substep
+from torchmpm.substep import Scene, substep
 from torchmpm.tree import transforming
 
 
@@ -225,23 +225,25 @@ class Solver:
         self._try_laws(state)
         scene = self.scene(state, actuation, origin)
         if self._reads_scene_alone:
-            end = repeated(self.substep, state.components(), substeps, segment=segment, shared=scene)
+            end = repeated(substep, state.components(), substeps, segment=segment, shared=scene)
         else:
-            end = repeated(partial(self.substep, scene), state.components(), substeps, segment=segment)
+            own = partial(substep, scene, boundary=self.boundary)
+            end = repeated(own, state.components(), substeps, segment=segment)
         return ParticleState.from_stack(torch.stack(end))
 
-    def substep(self, scene: Scene, state: Components) -> Components:
-        """One substep of a scene, from the components (B, N) of a ``state`` to new ones.
+    def boundary(self, scene: Scene, velocity: Tensor) -> Tensor:
+        """What the surroundings do to the velocities (2, B, cells) of the nodes, m/s, in a substep.
 
-        A subclass may compute it in another way. It runs on the eager backend.
+        Here the velocity rules. A subclass may add surfaces of other shapes, or ones that move; it runs on the eager
+        backend. :meth:`torchmpm.Grid.nodes` says where the nodes are.
         """
-        return substep(scene, state)
+        return constrain(scene.faces, velocity)
 
     @property
     def _overridden(self) -> str | None:
         """Which of the methods that the eager backend calls a subclass overrides, if any."""
         own = type(self)
-        return next((n for n in ("substep", "scene") if getattr(own, n) is not getattr(Solver, n)), None)
+        return next((n for n in ("scene", "boundary") if getattr(own, n) is not getattr(Solver, n)), None)
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.

@@ -4,8 +4,9 @@
 particles.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -42,6 +43,9 @@ class Scene:
     actuation: Tensor | None  # (2, B, cells) on the nodes, Pa
 
 
+Boundary: TypeAlias = Callable[[Scene, Tensor], Tensor]
+
+
 class Scattered(NamedTuple):
     """Result of the first half of a substep."""
 
@@ -52,12 +56,16 @@ class Scattered(NamedTuple):
     momentum: Tensor  # (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes
 
 
-def substep(scene: Scene, state: Components) -> Components:
-    """Advance all particles by one substep: from components (B, N) to components (B, N)."""
+def substep(scene: Scene, state: Components, boundary: Boundary | None = None) -> Components:
+    """Advance all particles by one substep: from components (B, N) to components (B, N).
+
+    ``boundary`` is what the surroundings do to the velocities of the nodes, see :meth:`torchmpm.Solver.boundary`; by
+    default the velocity rules of the scene.
+    """
     state = _detach_unresolved(scene, state)
     scattered = particles_to_grid(scene, state)
     velocity = grid_velocity(scene, scattered.momentum)
-    velocity = constrain(scene.faces, velocity)
+    velocity = constrain(scene.faces, velocity) if boundary is None else boundary(scene, velocity)
     v, C = transfer.grid_to_particles(scene.grid, scattered.nodes, velocity)
     x, y = state[:2]
     moved = (x + scene.dt * v[0], y + scene.dt * v[1], *v, *C, *scattered.F, scattered.Jp)

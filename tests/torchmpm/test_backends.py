@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory, tree
 from torchmpm.native import library
 from torchmpm.native.library import find_compiler
-from torchmpm.substep import Components, Scene
+from torchmpm.substep import Scene
 
 
 @pytest.fixture
@@ -44,9 +44,9 @@ class Own(VonMises):
 class Still(Solver):
     """Its particles rest."""
 
-    def substep(self, scene: Scene, state: Components) -> Components:
+    def boundary(self, scene: Scene, velocity: Tensor) -> Tensor:
         """Nothing moves."""
-        return state
+        return torch.zeros_like(velocity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +60,28 @@ class Slippery(Solver):
         scene = super().scene(state, actuation, origin)
         faces = tuple(replace(face, friction=self.friction * face.active) for face in scene.faces)
         return replace(scene, faces=faces)
+
+
+class Floor(Solver):
+    """A floor between the seventh and the eighth row of nodes, as a surface of its own."""
+
+    def boundary(self, scene: Scene, velocity: Tensor) -> Tensor:
+        """Nothing falls through it."""
+        below = self.grid.nodes(scene.origin)[1] < 7.5 * self.grid.h
+        return torch.stack((velocity[0], torch.where(below, velocity[1].clamp_min(0.0), velocity[1])))
+
+
+def test_a_surface_of_ones_own_acts_as_the_rule_in_its_place() -> None:
+    """In windows at two places."""
+    state, origin = lively(30, 2), torch.tensor([[0.0, 0.0], [2 / 16, 1 / 16]], dtype=torch.float64)
+    bodies, floor = robot(30).bodies, VelocityRule("-y", j=(None, 7))
+    own, rule, none = (
+        Floor(GRID, bodies, (0.5, -9.8)),
+        *(robot(30, bodies=bodies, rules=rules) for rules in ((floor,), ())),
+    )
+    ends = [solver.step(state, substeps=20, origin=origin) for solver in (own, rule, none)]
+    assert_identical(*ends[:2])
+    assert not torch.equal(ends[0].x, ends[2].x)
 
 
 class Narrow(Grid):
