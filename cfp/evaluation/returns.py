@@ -28,6 +28,7 @@ from cfp.errors import NonFiniteError
 from cfp.messages import progress_bar
 from cfp.policy import Memory, Observation, Policy, Start
 from dittogym import Conditions, TorchEnv
+from dittogym.action import trained_layout
 from dittogym.copies import to_device, to_host
 from dittogym.env import as_numpy
 from dittogym.pieces import largest_piece
@@ -381,7 +382,7 @@ def evaluate_policy(
             positions on which nothing was trained here.
         deterministic: Act without noise.
         options: Of the environment, such as ``particles`` and ``conditions``, see `dittogym.TorchEnv`; ``resolution``
-            is that of the policy if it has one.
+            and ``action_layout`` are those of the policy if it has them.
 
     Raises:
         ValueError: An argument is out of range, or an action has another shape.
@@ -396,8 +397,8 @@ def evaluate_policy(
     """
     checks.whole("episodes", episodes, 1)
     checks.whole("seed", seed, 0)
-    if hasattr(policy, "resolution"):
-        options = {"resolution": policy.resolution} | options
+    own = {"resolution": getattr(policy, "resolution", None), "action_layout": trained_layout(policy)}
+    options = {name: value for name, value in own.items() if value is not None} | options
 
     def make_env(count: int) -> TorchEnv:
         return TorchEnv(task, count, **options)

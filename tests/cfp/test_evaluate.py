@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -199,5 +200,17 @@ def test_any_policy_is_evaluated_as_those_of_the_package():
     deterministic = cfp.evaluate_policy(Waves(), "shapematch", 3, seed=5, deterministic=True, **options)
     late = cfp.evaluate_policy(Waves(), "shapematch", 3, seed=5, conditions=Conditions(latency=2), **options)
     assert len({result.returns, deterministic.returns, late.returns}) == 3
+    column = np.zeros((1, 2, 4, 4))
+    column[..., 3] = 1
+    acting = {"predict": lambda *_, **__: (column, None)}
+    image, grid, trained = (
+        cfp.evaluate_policy(SimpleNamespace(**acting, **about), "shapematch", 1, **options, **layout).mean
+        for about, layout in (
+            ({}, {}),
+            ({}, {"action_layout": "grid"}),
+            ({"description": {"environment": {"action_layout": "grid"}}}, {}),
+        )
+    )
+    assert image != grid == trained
     policy = cfp.load("shapematch")
     assert cfp.evaluate_policy(policy, "shapematch", 1, particles=100, substeps=1).resolution == policy.resolution
