@@ -77,7 +77,7 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
     if not isinstance(torch_env, TorchEnv):
         raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
     if isinstance(env, gymnasium.Env) and (ignored := _changes(env, torch_env.spec.horizon)):
-        raise ValueError(f"env must have no wrappers, which have no part in a recording, got {ignored}: env.unwrapped")
+        raise ValueError(f"env must have no wrappers, which would have no part in it, got {ignored}; use env.unwrapped")
     if torch_env.num_envs != 1:
         raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
     checks.instances("fields", fields, str)
