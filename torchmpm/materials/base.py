@@ -102,7 +102,8 @@ def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
         return value
     *shapes, last = dict.fromkeys(((), (batch,), (batch, 1), (batch, count), (1, count)))
     allowed = f"{', '.join(map(str, shapes))} or {last}"
-    raise ValueError(f"{name} must be a number or have shape {allowed}, got {tuple(value.shape)}")
+    of = f"{batch} simulation{'s' * (batch > 1)} of {count} particles"
+    raise ValueError(f"{name} must be a number or have shape {allowed} for {of}, got {tuple(value.shape)}")
 
 
 def detached_column(value: Value) -> Value:
