@@ -131,7 +131,7 @@ def test_interfaces_of_arrays_wait_once(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr("dittogym.env.to_host", to_host)
     single, batch = gymnasium.make("dittogym/run-coarse-v0", **SMALL), make_vec("run", 2)
-    vec: VecEnv = TorchVecEnv(tiny("kick", 2), max_episode_steps=2)
+    vec: VecEnv = TorchVecEnv(tiny("kick", 2), max_episode_steps=2, stagger=True)
     single.reset(seed=0), batch.reset(seed=0), vec.reset()
     for env in (single, batch):
         copied.clear()

@@ -106,7 +106,8 @@ def test_next_step_autoreset() -> None:
 
 def test_the_step_in_which_an_element_is_reset_has_no_reward() -> None:
     def reward_fn(transition: dittogym.Transition, spec: dittogym.TaskSpec) -> dittogym.Reward:
-        return dittogym.Reward({"risen": transition.now.com[:, 1] / 0.0})
+        moved = transition.now.com[:, 1] != transition.start.com[:, 1]
+        return dittogym.Reward({"risen": torch.where(moved, torch.inf, 0.0)})
 
     spec = replace(dittogym.make_spec("run"), reward_fn=reward_fn, weights={"risen": 1.0}, horizon=1)
     envs = dittogym.BatchEnv(spec, 2, **SMALL)
