@@ -202,6 +202,8 @@ def rankings(results: Iterable[dict[str, Any]]) -> list[Table]:
 
 def run(command: Command) -> None:
     """Evaluate and rank."""
+    if not command.policies:
+        raise ConfigError("policies must be one or more, got none")
     paths = [Path(name) for name in command.policies if name.endswith(".json")]
     results = {path.resolve(): read_results(path) for path in paths}  # a policy counts once
     names = [name for name in command.policies if not name.endswith(".json")]

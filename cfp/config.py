@@ -75,7 +75,7 @@ class TaskConfig:
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
     algo: str
-    """Name of the algorithm."""
+    """Name of the algorithm; MODULE:CLASS for one of your own."""
     preset: Preset = "quick"
     """Set of default options: quick (minutes), long (hours; soft actor-critic only), or paper (published values)."""
     seed: int = 0
@@ -114,7 +114,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
     @property
     def name(self) -> str:
         """Name of the run, used for its folder."""
-        return f"{self.algo}-{task_name(self.task)}-{self.preset}-{self.seed}"
+        return f"{task_name(self.algo)}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def make_spec(self) -> TaskSpec:
         """The task, with its options."""

@@ -26,12 +26,18 @@ OTHER_NAMES: dict[str, str] = {}
 
 
 def find(name: str) -> type[Learner]:
-    """The class of an algorithm; a `ConfigError` if there is none of that name."""
-    if name not in ALGORITHMS:
+    """The class of an algorithm in `ALGORITHMS`, or of ``"MODULE:CLASS"``; a `ConfigError` if there is none."""
+    module, _, attribute = ALGORITHMS.get(name, name).partition(":")
+    if name not in ALGORITHMS and not (attribute and module.isidentifier()):  # files must not reach below the folder
         hint = "" if OTHER_NAMES else "; baselines.fit and baselines.Run know others"  # it has not been imported
-        raise ConfigError(OTHER_NAMES.get(name, f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}{hint}"))
-    module, _, attribute = ALGORITHMS[name].partition(":")
-    algorithm: type[Learner] = getattr(import_module(module), attribute)
+        allowed = f"one of {', '.join(ALGORITHMS)} or MODULE:CLASS"
+        raise ConfigError(OTHER_NAMES.get(name, f"algo must be {allowed}, got {name!r}{hint}"))
+    try:
+        algorithm = getattr(import_module(module), attribute)
+    except Exception as error:  # whatever a user's module does
+        raise ConfigError(f"algo: {name} cannot be imported ({type(error).__name__}: {error})") from error
+    if not (isinstance(algorithm, type) and issubclass(algorithm, Learner)):
+        raise ConfigError(f"algo must name a subclass of cfp.learner.Learner, got {name!r}")
     return algorithm
 
 

@@ -78,7 +78,7 @@ def parse(words: Sequence[str], module: str = "cfp.train", started: str | None =
     values = _read_file(first.config)
     values |= {name: value for name in DECISIVE if _is_given(value := getattr(first, name))}
     defaults, out = _defaults(values, None if first.out is None else parse_folder("out", first.out), first.resume)
-    algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}.\nTasks: {', '.join(dittogym.TASKS)}."
+    algorithms = f"Algorithms: {', '.join(registry.ALGORITHMS)}, MODULE:CLASS.\nTasks: {', '.join(dittogym.TASKS)}."
     about = f"{inspect.cleandoc(Command.__doc__ or '')}\n\n{algorithms}"
     command = read_command(Command, module, EXAMPLES, words, started, about, default=Command(defaults, out=out))
     return _complete(command)

@@ -415,10 +415,10 @@ class TorchEnv:
         if action.layout is not torch.strided or action.is_meta:
             raise ValueError(f"action must hold dense numbers, got a tensor of {action.layout} on {action.device}")
         if tuple(action.shape) != (shape := (self.num_envs, *self.action_shape)):
-            raise ValueError(
-                f"action must have shape {shape}, got {tuple(action.shape)}; the option resolution of the environment "
-                "sets its last two numbers"
-            )
+            hint = "the first number is that of the simulations, num_envs"
+            if tuple(action.shape[-3:]) != self.action_shape:
+                hint = "the option resolution of the environment sets its last two numbers"
+            raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}; {hint}")
         action = action.to(self.device, self.dtype)
         if self._unread is not None:
             self._unread = self._unread + (action.detach() * 0.0).sum()

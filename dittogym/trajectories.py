@@ -7,7 +7,8 @@ import os
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ __all__ = ["Episode", "load_episodes", "load_minari", "record", "save_episodes",
 #: Attributes of :class:`torchmpm.ParticleState`.
 FIELDS = ("x", "v", "C", "F", "Jp")
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
-FORMAT, VERSION = "dittogym-episodes", 1
+ABOUT = ("seed", "task", "environment")
+FORMAT, VERSION = "dittogym-episodes", 2
 #: What zipfile raises for damaged archives, besides ``OSError`` and ``EOFError``.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
@@ -38,13 +40,15 @@ class Episode:
 
     Attributes:
         observations: (T + 1, 3, 64, 64) uint8, from the reset to the end.
-        actions: (T, 2, R, R), as the policy chose them.
+        actions: (T, 2, R, R), as the policy chose them; what exceeds [-1, 1] is cut off after they are enlarged.
         rewards: (T,).
         terminations: (T,) bool, whether the task ended the episode.
-        truncations: (T,) bool, whether the time limit ended it.
+        truncations: (T,) bool, whether a time limit ended it.
         particles: Of the states, by name: ``x`` (T + 1, N, 2) in m, ``v`` (T + 1, N, 2) in m/s, and others on request.
         seed: Seed of the reset.
         task: Name of the task.
+        environment: Options of the environment, as JSON values. A robot and obstacles of one's own are not among them,
+            and of ``options["physics"]`` in effect only the names.
     """
 
     observations: np.ndarray
@@ -55,29 +59,38 @@ class Episode:
     particles: dict[str, np.ndarray]
     seed: int
     task: str
+    environment: dict[str, Any]
 
 
-def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x", "v")) -> Episode:
+def record(
+    env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x", "v"), max_steps: int | None = None
+) -> Episode:
     """Reset an environment, play an episode, and record it as arrays.
 
+    The same actions in an environment with the same options give the same episode again, to the last bit on the same
+    kind of processor.
+
     Args:
-        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package without
-            wrappers of your own, which would have no part in it.
+        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package, with a time
+            limit if you like, but without other wrappers, which would have no part in it.
         policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
         seed: Seed of the reset and of the policy's noise.
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
+        max_steps: Truncate a longer episode after so many steps; ``None``: the time limit of ``env``.
 
     Raises:
         TypeError: The environment, the policy or ``fields`` is of another kind.
-        ValueError: The environment has more than one simulation, or wrappers, or there is no such field.
+        ValueError: The environment has more than one simulation, or wrappers, there is no such field, or ``max_steps``
+            is no whole number from 1.
     """
     seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
     torch_env = inner.torch_env if isinstance(inner, Env) else inner
     if not isinstance(torch_env, TorchEnv):
         raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
-    if isinstance(env, gymnasium.Env) and (ignored := _changes(env, torch_env.spec.horizon)):
-        raise ValueError(f"env must have no wrappers, which would have no part in it, got {ignored}; use env.unwrapped")
+    limit = _time_limit(env, torch_env.spec.horizon)
+    if max_steps is not None:
+        limit = min(limit, checks.whole("max_steps", max_steps, 1))
     if torch_env.num_envs != 1:
         raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
     checks.instances("fields", fields, str)
@@ -85,23 +98,40 @@ def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x"
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
     act = inner.acting(policy) if isinstance(inner, Env) else as_function(policy, torch_env)
     observations, actions, ends, states = [], [], [], []
-    for images, chosen, end in play(torch_env, act, seed):
+    for images, chosen, end in islice(play(torch_env, act, seed), limit + 1):
         observations.append(images.copy())
         states.append([getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields])
         if chosen is not None:
             actions.append(chosen.copy())
             ends.append([value.item() for value in end[:3]])
     rewards, terminations, truncations = (np.array(values) for values in zip(*ends, strict=True))
+    truncations[-1] |= len(ends) == limit
     particles = {name: np.stack(values) for name, values in zip(fields, zip(*states, strict=True), strict=True)}
     images, done = np.concatenate(observations), (terminations, truncations)
-    return Episode(images, np.concatenate(actions), rewards, *done, particles, seed, torch_env.spec.name)
+    options = _options(torch_env) | {"physics": sorted(torch_env.env_state.physics)}
+    task, played = torch_env.spec.name, np.concatenate(actions)
+    return Episode(images, played, rewards, *done, particles, seed, task, options)
+
+
+def _options(env: TorchEnv) -> dict[str, Any]:
+    """`Episode.environment`."""
+    conditions = None if env.conditions is None else asdict(env.conditions)
+    return {
+        "particles": list(env.model.camera.counts),
+        "substeps": env.model.substeps,
+        "dt": env.model.solver.dt,
+        "dtype": str(env.dtype).removeprefix("torch."),
+        "resolution": env.action_resolution,
+        "action_layout": env.action_layout,
+        "conditions": json.loads(json.dumps(conditions)),
+    }
 
 
 def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> Path:
     """Write episodes to a compressed NumPy archive, and return its path.
 
     The archive holds of each episode i arrays such as ``i/actions`` and ``i/particles/x``, and a JSON string ``about``
-    with seeds and tasks.
+    with seeds, tasks and options of the environments.
 
     Args:
         path: A file ``.npz``.
@@ -119,7 +149,9 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
     for i, episode in enumerate(episodes):
         arrays |= {f"{i}/{name}": getattr(episode, name) for name in ARRAYS}
         arrays |= {f"{i}/particles/{name}": values for name, values in episode.particles.items()}
-    listed = [{"seed": episode.seed, "task": episode.task, "fields": list(episode.particles)} for episode in episodes]
+    listed = [
+        {name: getattr(episode, name) for name in ABOUT} | {"fields": [*episode.particles]} for episode in episodes
+    ]
     about = json.dumps({"format": FORMAT, "version": VERSION, "episodes": listed})
     with replacing(file) as aside:
         np.savez_compressed(aside, about=np.array(about), **arrays)
@@ -137,6 +169,8 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
         FileNotFoundError: There is no such file.
     """
     try:
+        if not zipfile.is_zipfile(path) and os.path.exists(path):
+            raise ValueError("it is no archive")  # NumPy would suggest to unpickle it
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             about = json.loads(str(archive["about"]))
             if (about["format"], about["version"]) != (FORMAT, VERSION):
@@ -145,8 +179,7 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
                 Episode(
                     **{name: archive[f"{i}/{name}"] for name in ARRAYS},
                     particles={name: archive[f"{i}/particles/{name}"] for name in episode["fields"]},
-                    seed=episode["seed"],
-                    task=episode["task"],
+                    **{name: episode[name] for name in ABOUT},
                 )
                 for i, episode in enumerate(about["episodes"])
             ]
@@ -171,27 +204,27 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
 
     Raises:
         ImportError: Minari or h5py is not installed.
-        ValueError: There is no episode, or they are of several tasks, or the environment has another task or other
-            actions.
+        ValueError: There is no episode, or the episodes and the environment are not all of one task with the same
+            options.
         TypeError: An item is not an :class:`Episode`, or the environment is not a Gymnasium environment of this
             package.
     """
     minari = _minari()
     _check(episodes)
-    if len(tasks := {episode.task for episode in episodes}) > 1:
-        raise ValueError(f"episodes must be of one task, got {', '.join(sorted(tasks))}")
     inner: Any = getattr(env, "unwrapped", env)
     if not isinstance(inner, Env):
         raise TypeError(f"env must be a Gymnasium environment of this package, got {env!r}")
-    given = f"{inner.torch_env.spec.name} with actions {inner.action_space.shape}"
-    if given != (allowed := f"{episodes[0].task} with actions {episodes[0].actions.shape[1:]}"):
-        raise ValueError(f"env must be of task {allowed}, got {given}")
+    own = {"task": inner.torch_env.spec.name, **_options(inner.torch_env)}
+    for i, episode in enumerate(episodes):
+        for name, value in {"task": episode.task, **episode.environment}.items():
+            if value != own.get(name, value):  # physics is given to a reset
+                raise ValueError(f"env must have {name} {value} as episodes[{i}], got {own[name]}")
     buffers = [
         minari.data_collector.EpisodeBuffer(
             id=i,
             seed=episode.seed,
             observations=list(episode.observations),
-            actions=list(episode.actions),
+            actions=list(episode.actions.astype(inner.action_space.dtype)),
             rewards=list(episode.rewards),
             terminations=list(episode.terminations),
             truncations=list(episode.truncations),
@@ -201,7 +234,7 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
     ]
     options = {"data_format": "hdf5", "jpeg_encoding": False, "description": episodes[0].task} | metadata
     dataset = minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **options)
-    dataset.storage.update_metadata({"task": episodes[0].task})
+    dataset.storage.update_metadata({"task": episodes[0].task, "environment": json.dumps(episodes[0].environment)})
     return dataset
 
 
@@ -209,26 +242,28 @@ def load_minari(dataset_id: str) -> list[Episode]:
     """Read what :func:`save_minari` wrote: the dataset ``dataset_id``. Needs the extra ``minari``."""
     dataset = _minari().load_dataset(dataset_id)
     seeds = [about["seed"] for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
-    task = dataset.storage.metadata["task"]
+    about = dataset.storage.metadata
     return [
         Episode(
             **{name: np.asarray(getattr(episode, name)) for name in ARRAYS},
             particles={name: np.asarray(values) for name, values in (episode.infos or {}).items()},
             seed=int(seed),
-            task=task,
+            task=about["task"],
+            environment=json.loads(about["environment"]),
         )
         for episode, seed in zip(dataset.iterate_episodes(), seeds, strict=True)
     ]
 
 
-def _changes(env: gymnasium.Env[Any, Any], horizon: int) -> gymnasium.Wrapper[Any, Any, Any, Any] | None:
-    """The outermost wrapper of an environment that ``gymnasium.make`` without options does not put around it."""
+def _time_limit(env: Any, limit: int) -> int:
+    """The least of the time limits of an environment's wrappers and ``limit``; refuses other wrappers."""
     while isinstance(env, gymnasium.Wrapper):
-        limit = env.spec.max_episode_steps if isinstance(env, TimeLimit) and env.spec else None
-        if not isinstance(env, PassiveEnvChecker | OrderEnforcing) and limit != horizon:
-            return env
+        if isinstance(env, TimeLimit) and env.spec and env.spec.max_episode_steps:
+            limit = min(limit, env.spec.max_episode_steps)
+        elif not isinstance(env, PassiveEnvChecker | OrderEnforcing):
+            raise ValueError(f"env must have no wrappers, which would have no part in it, got {env}; use env.unwrapped")
         env = env.env
-    return None
+    return limit
 
 
 def _check(episodes: Sequence[Episode]) -> None:

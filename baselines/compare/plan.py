@@ -113,7 +113,7 @@ def resolved(options: Options) -> RunConfig:
 
 def reference_config(options: Options) -> RunConfig:
     """The configuration in whose environment a reference policy acts, that of a single stage of learning."""
-    kept = {name: value for name, value in options.items() if name in ("task", *SAME_FOR_ALL)}
+    kept = {name: value for name, value in options.items() if name in ("task", "device", *SAME_FOR_ALL)}
     preset = "paper" if options["preset"] == "paper" else "quick"
     return resolved({"algo": "coarse", "preset": preset, **kept})
 
@@ -200,14 +200,19 @@ def make_runs(
                     if useless := sorted(plan["algos"].get(label, {}).keys() - {"algo"}):
                         raise ConfigError(f"{useless[0]} must not be under algos.{label}, which is not trained")
                     reference_config(options)
+                    options = {name: options[name] for name in ("algo", *GIVEN, *SAME_FOR_ALL) if name in options}
                 elif hasattr(resolved(options), "steps") and steps is not None:
                     options.setdefault("steps", steps)
                     resolved(options)
             except ConfigError as error:
                 raise ConfigError(f"{label} on {task}: {error}") from error
             found[task, label] = options
+
+    def folder_name(label: str, task: str, seed: int) -> str:
+        return f"{task_name(label)}-{task_name(task)}-{preset}-{seed}"
+
     runs = [
-        PlannedRun(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task_name(task)}-{preset}-{seed}")
+        PlannedRun(label, task, seed, options | {"seed": seed}, folder / folder_name(label, task, seed))
         for seed in seeds
         for (task, label), options in found.items()
         if seed == seeds[0] or options["algo"] not in REFERENCE_POLICIES
@@ -228,5 +233,6 @@ def _options(plan: dict[str, Any], label: str, task: str, given: Options) -> Opt
     own |= own.pop("tasks", {}).get(task, {})
     options = {"video": False, **plan["common"], **plan["tasks"].get(task, {}), **own}
     # An algo under common or tasks is that of variants; an algorithm keeps its own.
-    algo = own.get("algo", label if label in {*ALGORITHMS, *REFERENCE_POLICIES} else options.get("algo", label))
+    known = label in {*ALGORITHMS, *REFERENCE_POLICIES} or ":" in label
+    algo = own.get("algo", label if known else options.get("algo", label))
     return {"algo": algo, "task": task, **given, **{name: options[name] for name in options if name != "algo"}}

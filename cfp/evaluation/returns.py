@@ -96,6 +96,20 @@ class UntrainedPolicy:
         return actions.numpy(), state
 
 
+class FunctionPolicy:
+    """A function of the observation alone; raises a `TypeError` for anything else."""
+
+    def __init__(self, function: Any) -> None:
+        if not callable(function):
+            raise TypeError(f"policy must be a function or have a method predict, got {type(function).__name__}")
+        self.function = function
+
+    @torch.no_grad()
+    def predict(self, observation: Observation, *_: Any, **__: Any) -> tuple[np.ndarray, Memory]:
+        """Actions of the function, and no memory."""
+        return np.asarray(self.function(observation)), None
+
+
 # Playing episodes.
 
 
@@ -361,7 +375,7 @@ def evaluate(
 
 
 def evaluate_policy(
-    policy: PolicyPredictor,
+    policy: PolicyPredictor | Callable[[np.ndarray], Any],
     task: str | TaskSpec,
     episodes: int = 20,
     *,
@@ -374,8 +388,9 @@ def evaluate_policy(
     The result is the same, to the last bit, whatever the number of cores.
 
     Args:
-        policy: A policy of this package, a model of stable-baselines3, or another object with its ``predict``, which
-            gets images (B, 3, 64, 64) uint8 and returns actions (B, 2, R, R), and its memory, or ``None``.
+        policy: A policy of this package, a model of stable-baselines3, another object with its ``predict(observation,
+            state, episode_start, deterministic)``, which returns actions (B, 2, R, R) and its memory or ``None``, or a
+            function of the observation alone, images (B, 3, 64, 64) uint8.
         task: A task of `dittogym`, also ``"MODULE:NAME"``, or a specification.
         episodes: Number of episodes.
         seed: Of the first episode; the next ones have the seeds after it. With the default value they start from
@@ -385,6 +400,7 @@ def evaluate_policy(
             and ``action_layout`` are those of the policy if it has them.
 
     Raises:
+        TypeError: The policy is of another kind.
         ValueError: An argument is out of range, or an action has another shape.
         NonFiniteError: An action or a reward is NaN or infinite.
 
@@ -399,13 +415,14 @@ def evaluate_policy(
     checks.whole("seed", seed, 0)
     own = {"resolution": getattr(policy, "resolution", None), "action_layout": trained_layout(policy)}
     options = {name: value for name, value in own.items() if value is not None} | options
+    acting = policy if hasattr(policy, "predict") else FunctionPolicy(policy)
 
     def make_env(count: int) -> TorchEnv:
         return TorchEnv(task, count, **options)
 
     env = make_env(1)  # refuses options before threads begin, and knows the horizon
     together = env.device.type != "cpu"
-    trial = Trial("policy", env.action_resolution, policy, make_env, episodes, deterministic, seed, together)
+    trial = Trial("policy", env.action_resolution, acting, make_env, episodes, deterministic, seed, together)
     return evaluate([trial], env.spec.horizon)[0]
 
 

@@ -1,9 +1,10 @@
-"""Reads drawings from image files and arrays."""
+"""Reads drawings from image files, arrays and outlines."""
 
 from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import cv2
@@ -16,17 +17,27 @@ LARGEST = 2**22
 OPAQUE = 128
 #: Pictures whose brightness varies less than this have no drawing, all belongs to it or nothing.
 CONTRAST = 32
-#: The path of an image file, or an array.
-PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
+#: Pixels along the longer side of an outline.
+OUTLINE_PIXELS = 512
+#: The path of an image file, an array (picture), or (K, 2) corners (outline).
+DrawingLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]"
 
 
-def read_mask(picture: PictureLike, name: str, others: str) -> np.ndarray:
-    """What is drawn in a picture, (H, W) bool, row 0 at the top.
+def read_mask(drawing: DrawingLike, name: str, others: str = "") -> np.ndarray:
+    """What is drawn in a picture, or what an outline encloses, (H, W) bool, row 0 at the top.
 
     In a picture with transparent pixels it is what is not transparent; else what is bright, or, where all four corners
-    are bright, what is dark. Bool arrays are taken as they are. Colours may come in any order, RGB or BGR.
+    are bright, what is dark. Bool arrays are taken as they are. Colours may come in any order, RGB or BGR. An outline
+    is a sequence of corners (x, y), x to the right and y upwards, in any unit.
     """
-    image = _read(picture, name, others)
+    if isinstance(drawing, list | tuple | np.ndarray):
+        try:
+            drawing = np.asarray(drawing)
+        except ValueError as error:
+            raise ValueError(f"{name} must be {others}an outline, an array or a path, got rows that differ") from error
+        if drawing.shape[1:] == (2,) and drawing.dtype.kind in "fiu":
+            return _enclosed(drawing.astype(np.float64), name)
+    image = _read(drawing, name, others)
     if image.ndim == 3 and image.shape[2] == 4 and (image[..., 3] < OPAQUE).any():
         return np.asarray(image[..., 3] >= OPAQUE)
     grey = image if image.ndim == 2 else _brightness(image[..., :3])
@@ -35,7 +46,23 @@ def read_mask(picture: PictureLike, name: str, others: str) -> np.ndarray:
         threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)
     mask = np.asarray(grey > threshold)
     on_bright = mask[[0, 0, -1, -1], [0, -1, 0, -1]].all() and not mask.all()
-    return ~mask if on_bright and np.asarray(picture).dtype != bool else mask
+    return ~mask if on_bright and np.asarray(drawing).dtype != bool else mask
+
+
+def _enclosed(corners: np.ndarray, name: str) -> np.ndarray:
+    """The inside of an outline with corners (K, 2)."""
+    if len(corners) < 3 or not np.isfinite(corners).all():
+        raise ValueError(f"{name} must have at least 3 finite corners, got {corners.tolist()}")
+    size = np.ptp(corners, axis=0).max()
+    pixels = (corners - corners.min(0)) * (OUTLINE_PIXELS / size if size > 0 else 1.0)
+    height, width = np.ceil(pixels.max(0)).astype(int)[::-1] + 1
+    image, outline = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
+    path = [np.round(pixels).astype(np.int32)]
+    cv2.fillPoly(image, path, 1)
+    cv2.polylines(outline, path, isClosed=True, color=1)
+    if not (image > outline).any():
+        raise ValueError(f"{name} must have corners that enclose an area, got {corners.tolist()}")
+    return np.flipud(image).astype(bool)
 
 
 def _brightness(colours: np.ndarray) -> np.ndarray:
@@ -57,20 +84,16 @@ def _separation(grey: np.ndarray) -> float:
     return float(bright.mean() * (~bright).mean() * (grey[bright].mean() - grey[~bright].mean()) ** 2)
 
 
-def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
+def _read(picture: DrawingLike, name: str, others: str) -> np.ndarray:
     """A picture as uint8 (H, W), (H, W, 3) or (H, W, 4)."""
-    if isinstance(picture, list):  # an array that was JSON
-        try:
-            picture = np.asarray(picture)
-        except ValueError as error:
-            raise ValueError(f"{name} must be {others}an array or a path, got rows of different lengths") from error
     if isinstance(picture, np.ndarray):
         return _as_bytes(picture, name)
     if not isinstance(picture, (str, os.PathLike)):
-        raise ValueError(f"{name} must be {others}an array or a path, got {type(picture).__name__}")
+        raise ValueError(f"{name} must be {others}an outline, an array or a path, got {type(picture).__name__}")
     path = os.fspath(picture)
     if not os.path.isfile(path):
-        raise ValueError(f"{name} must be {others}an array or the path of an image; no such file: {path!r}")
+        given = f"no such file: {path!r}"
+        raise ValueError(f"{name} must be {others}an outline, an array or the path of an image; {given}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours

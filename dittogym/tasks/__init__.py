@@ -33,7 +33,7 @@ _defined_in: dict[str, str | None] = {}
 
 
 def task_name(task: str) -> str:
-    """The name alone of a task that may be given as ``"MODULE:NAME"``."""
+    """The name alone of a task, or of something else, that may be given as ``"MODULE:NAME"``."""
     return task.rpartition(":")[2]
 
 

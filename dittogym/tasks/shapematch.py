@@ -1,6 +1,6 @@
 """SHAPE MATCH: take the shape of a picture, without gravity."""
 
-from dittogym.bodies.images import PictureLike
+from dittogym.bodies.images import DrawingLike
 from dittogym.bodies.shapes import Disc
 from dittogym.copies import constant
 from dittogym.geometry import ceiling, floor
@@ -23,7 +23,7 @@ def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
     return Reward(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 
 
-def shapematch(target: PictureLike = "star", fit: bool = True) -> TaskSpec:
+def shapematch(target: DrawingLike = "star", fit: bool = True) -> TaskSpec:
     """The task SHAPE MATCH.
 
     Args:

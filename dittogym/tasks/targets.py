@@ -8,7 +8,7 @@ import warnings
 import cv2
 import numpy as np
 
-from dittogym.bodies.images import PictureLike, read_mask
+from dittogym.bodies.images import DrawingLike, read_mask
 from dittogym.observation import SIZE
 from torchmpm import checks
 
@@ -45,19 +45,19 @@ _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
 # fmt: on
 
 
-def load_target(target: PictureLike, fit: bool = True) -> np.ndarray:
+def load_target(target: DrawingLike, fit: bool = True) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:
-        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array (H, W), (H, W, 3) or (H, W, 4):
-            bool, uint8 0..255, or floating point 0..1. What is drawn in it is found by
-            :func:`dittogym.bodies.images.read_mask`.
+        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, an array (H, W), (H, W, 3) or (H, W, 4),
+            bool, uint8 0..255, or floating point 0..1, or corners (K, 2) of an outline, x to the right and y upwards.
+            What is drawn is found by :func:`dittogym.bodies.images.read_mask`.
         fit: Whether a drawing of another size or in another place is scaled to the robot's area, and moved to its
             centre, which is always in the middle of the observation. Without, the picture is resized as a whole.
 
     Raises:
-        ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
-            unset.
+        ValueError: Neither a name nor a readable image or outline, an array of another kind, or a picture without any
+            pixel set or unset.
     """
     checks.flag("fit", fit)
     if isinstance(target, str) and target in _OUTLINES:
