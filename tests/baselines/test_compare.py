@@ -20,7 +20,7 @@ from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
 from baselines.compare.plan import PlannedRun, make_runs, read_plan, to_words
 from baselines.compare.processes import LocalExecutor, Resources, carry_out
-from baselines.compare.report import align, make_table, paired_differences, read_result, write_report
+from baselines.compare.report import align, make_table, read_result, write_report
 from cfp.errors import ConfigError
 from cfp.files import write_json, write_text
 from cfp.tables import read_table
@@ -334,10 +334,6 @@ def test_a_folder_that_is_no_comparison_s_is_refused(tmp_path):
 
 
 # Statistics and the report.
-
-
-def test_differences_are_paired_by_seed():
-    assert paired_differences({0: 5.0, 1: 7.0, 2: 1.0}, {1: 4.0, 0: 3.0}) == [2.0, 3.0]
 
 
 def test_curves_are_aligned_where_all_have_values():

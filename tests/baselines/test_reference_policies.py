@@ -8,8 +8,7 @@ import torch
 
 from baselines import train
 from baselines.common.reference_policies import REFERENCE_POLICIES, wave
-from baselines.registry import configure, find
-from cfp.agent.actor import build_actor
+from baselines.registry import configure
 from cfp.tables import read_table
 from dittogym.action import patch_field, to_grid_layout
 from dittogym.rewards import action_cost
@@ -74,9 +73,3 @@ def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
     curves = [read_table(tmp_path / name / "evaluations.csv") for name in ("coarse", "cfp")]
     first = [row for row in curves[1] if row["stage"] == "1"]
     assert len(first) == 4 and curves[0][:4] == first and [row["step"] for row in curves[0][4:]] == ["50", "60"]
-
-
-@pytest.mark.parametrize(("task", "count"), [("run", 82_388), ("shapematch", 83_388)])
-def test_fine_from_scratch_has_the_size_of_the_papers(task, count):
-    spec = find("fine").preset(task, "paper").actor_spec(1)
-    assert sum(parameter.numel() for parameter in build_actor(spec).parameters()) == count

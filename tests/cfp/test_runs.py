@@ -11,7 +11,7 @@ from tiny_runs import TABLES, assert_same_run
 from watching import at_step, interrupt
 
 import cfp
-from cfp import messages, registry
+from cfp import registry
 from cfp.policy import read_policy
 
 pytestmark = pytest.mark.usefixtures("short")
@@ -49,13 +49,6 @@ def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finishe
     assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
     assert_same_run(folder, finished, (*TABLES, "policy.safetensors", "config.json"))
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_short_training_shows_no_bar_where_there_is_no_terminal(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(messages, "SELDOM", 100.0)
-    short = {"resolutions": [4], "handover": [], "eval_every": 10, "eval_episodes": 1}
-    cfp.fit("shapematch", steps=20, out=tmp_path / "run", **OPTIONS | short)
-    assert capsys.readouterr().err == ""
 
 
 class Bare:
