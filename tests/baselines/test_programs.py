@@ -275,6 +275,10 @@ def test_presets_are_valid_survive_json_and_agree(task, preset):
         config = configure(values)
         config.check()
         assert configure(json.loads(json.dumps(to_json(config)))) == config, name
+        if name in ("cfp-analytic", "cfp-sac"):
+            stages = range(1, len(config.resolutions) + 1)
+            assert sum(config.stage_steps(stage) for stage in stages) == config.steps
+            assert [config.actor_spec(stage).resolutions[-1] for stage in stages] == list(config.resolutions)
         if find(name).sees in ("image", "state"):  # the others have no noise
             assert config.eval_deterministic == own.eval_deterministic, name
         if isinstance(config, type(own)) or name.startswith(("gnn", "transformer")):

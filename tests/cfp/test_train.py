@@ -185,17 +185,6 @@ def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_pat
     assert {path: path.read_bytes() for path in folder.glob("*.json")} == before
 
 
-def test_the_folder_to_resume_follows_from_the_options_that_name_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert resume("none") == 2
-    assert "none holds no run to resume; name a --task to start one there" in capsys.readouterr().err
-    folder = tmp_path / "runs" / "cfp-sac-shapematch-quick-3"
-    assert run(folder, "--seed", "3", *ONE_STAGE, "--steps", "20") == 0
-    again = parse("--task shapematch --learner sac --seed 3 --resume".split())
-    assert (again.out, again.run.steps) == (folder.relative_to(tmp_path), 20)
-    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-
-
 def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):
     def fail():
         raise OSError("no space left on device")
