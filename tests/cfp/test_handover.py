@@ -109,12 +109,6 @@ def test_run_without_a_checkpoint_is_continued_with_its_own_options_only(coarse,
     assert "config.json: cannot be read" in capsys.readouterr().err
 
 
-def test_a_policy_of_all_stages_is_refused_unless_it_is_refined(coarse, tmp_path, capsys):
-    assert run(tmp_path / "a", *ONE_STAGE, "--steps", "40", "--start-from", str(coarse)) == 2
-    message = "a policy of the first resolutions of (4,), but not all of them without refine, got (4,)"
-    assert message in capsys.readouterr().err
-
-
 def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     options = "--refine --critics-first 0.99 0 --eval-every 10 --eval-episodes 1 --steps 90 --handover 0.6".split()
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
