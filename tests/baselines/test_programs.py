@@ -165,15 +165,15 @@ def test_polish_is_evaluated_on_the_layout_it_is_made_for(finished):
     assert baselines.load(finished[1]).description["layout"] == 0
 
 
-def test_fit_is_the_command_line(tmp_path):
-    assert run("cem", tmp_path / "command") == 0
+@pytest.mark.parametrize("finished", ["cem"], indirect=True)
+def test_fit_is_the_command_line(finished, tmp_path):
     names = ("grid", "horizon", "commit", "iterations", "candidates", "elites", "eval_every", "checkpoint_every")
     options = dict(zip((*names, "log_every"), (8, 3, 2, 2, 5, 2, 3, 2, 2), strict=True))
     options |= {"particles": 100, "substeps": 1, "eval_episodes": 2, "video": False, "device": "cpu"}
     fitted = baselines.fit("cem", "shapematch", out=tmp_path / "python", **options)
     assert fitted.policy.description["kind"] == "cem" and [row["policy"] for row in fitted.results[2:]] == PLANNED_ROWS
     for name in ("config.json", "evaluations.csv", "results.json"):
-        assert (fitted.folder / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+        assert (fitted.folder / name).read_bytes() == (finished[1] / name).read_bytes(), name
     with pytest.raises(ConfigError, match="algo must be 'cem'"):
         baselines.fit("gnn-16", "shapematch", out=fitted.folder, resume=True)
 
