@@ -85,8 +85,6 @@ def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
     assert run._repr_png_().startswith(b"\x89PNG")
     recording = run.film(tmp_path / "film.html", speed=0.5)
     assert len(recording.rewards) == HORIZON and (tmp_path / "film.html").stat().st_size > 10_000
-    with pytest.raises(ValueError, match="path must end in"):
-        run.film(tmp_path / "film.doc")
     with pytest.raises(cfp.CheckpointError, match="no run"):
         cfp.Run(tmp_path)
 
