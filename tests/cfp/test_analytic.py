@@ -64,11 +64,6 @@ def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
         assert (model.solver.dt, model.substeps) == expected
 
 
-def go_on(done, infos):
-    """Whether the training goes on after a step."""
-    return True
-
-
 def parameters(module):
     return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 
@@ -196,6 +191,7 @@ def test_steps_with_success_pay_the_option_and_an_end_with_success_has_its_value
     # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
     config = WindowConfig(task="run", algo="shac", success_reward=2.0, window=1, gamma=0.9, max_episode_steps=10)
     collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
-    window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0, go_on)
+    rest = torch.zeros(2, *env.action_shape)
+    window = collector.collect(lambda _: rest, lambda seen: seen[:, 0] + 7.0, lambda *_: True)
     assert window.rewards.tolist() == [[pytest.approx(paid, abs=1e-6)] * 2]
     assert window.next_values.tolist() == [[pytest.approx(value)] * 2]
