@@ -350,15 +350,9 @@ def written(folder, label, seed, returns, observes="image", curve=None, plan=Non
     """A run as it lies in its folder."""
     run = PlannedRun(label, "run", seed, {"algo": label, "device": "cpu"}, folder / f"{label}-{seed}")
     layouts, successes = list(range(20000, 20000 + len(returns))), [value > 5 for value in returns]
-    evaluation = {
-        "policy": label if label == "zero" else "",
-        "episodes": len(returns),
-        "particles": "lite",
-        "noise": True,
-        "observes": observes,
-        "layouts": layouts,
-    }
-    evaluation |= {"returns": returns, "successes": successes, "own_layout": plan}
+    evaluation = {"policy": label if label == "zero" else "", "particles": "lite", "noise": True, "observes": observes}
+    evaluation |= {"episodes": len(returns), "layouts": layouts, "own_layout": plan}
+    evaluation |= {"returns": returns, "successes": successes}
     record = {"options": run.options, "evaluation": evaluation}
     write_json(run.folder / "comparison.json", record | ({"seconds": 120.0} if curve else {}))
     if curve:

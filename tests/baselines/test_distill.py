@@ -29,16 +29,8 @@ pytestmark = pytest.mark.usefixtures("short")  # SHAPE MATCH only
 
 def options(**changes):
     defaults = {"num_envs": 2, "particles": 300, "substeps": 4, "train_particles": 300, "device": "cpu"}
-    defaults |= {
-        "teacher": "mpc",
-        "horizon": 2,
-        "commit": 2,
-        "iterations": 1,
-        "planner_grid": 4,
-        "resolutions": (8, 16),
-        "encoder": "small",
-    }
-    defaults |= {"rollout_steps": 4, "updates": 2, "batch_size": 8}
+    defaults |= {"teacher": "mpc", "horizon": 2, "commit": 2, "iterations": 1, "planner_grid": 4}
+    defaults |= {"resolutions": (8, 16), "encoder": "small", "rollout_steps": 4, "updates": 2, "batch_size": 8}
     return replace(Distill.preset("run", "quick"), **defaults | changes)
 
 
