@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import distributions
 
-from cfp.agent.actor import ActorSpec, Sample, build_actor, normalise_image
+from cfp.agent.actor import ActorSpec, Encoded, Sample, build_actor, normalise_image
 from cfp.envs.make import make_torch_env
 from cfp.presets import sac_preset
-from cfp.sac.policies import TwinCritic
+from cfp.sac.policies import SmallCritics, TwinCritic
 from dittogym import TASKS, make_spec
 
 
@@ -99,6 +99,14 @@ def test_actor_has_the_reference_size(resolutions, split, count):
 @pytest.mark.parametrize(("split", "count"), [(False, 526082), (True, 464642)])
 def test_critics_have_the_reference_size_and_share_nothing(split, count):
     assert trainable(TwinCritic(8, split, "aligned")) == count
+
+
+def test_small_critics_equal_each_on_its_own():
+    critics, action = SmallCritics(8), torch.randn(2, 2, 8, 8)
+    seen = Encoded(torch.randn(2, 3, 32, 32), torch.randn(2, 16, 4, 4))
+    parts = critics.actions(action).chunk(2, dim=1)
+    expected = [head(torch.cat([seen.features, part], 1)) for head, part in zip(critics.heads, parts, strict=True)]
+    torch.testing.assert_close(list(critics(seen, action)), expected)
 
 
 def test_linear_layers_are_xavier():
