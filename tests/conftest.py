@@ -2,13 +2,17 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from hypothesis import settings
 from short_episodes import short_episodes
+from torch import Tensor
+
+from dittogym import TASKS, Reward, Transition, make_spec
 
 settings.register_profile("torchmpm", deadline=None)  # the first call of an operator may compile or allocate
 settings.load_profile("torchmpm")
@@ -40,6 +44,19 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def own_task(monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Registers RUN with another reward, a term as a function of the transition beside terms of the library."""
+
+    def register(term: Callable[[Transition], Tensor], **weights: float) -> str:
+        reward = {"reward_fn": lambda transition, spec: Reward({"own": term(transition)}), "weights": {"own": 1.0}}
+        reward["weights"] |= weights
+        monkeypatch.setitem(TASKS, "own", lambda: replace(make_spec("run"), name="own", **reward))
+        return "own"
+
+    return register
 
 
 @pytest.fixture(scope="module")

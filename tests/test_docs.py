@@ -1,6 +1,5 @@
 """Tables and pictures of the documents show the committed results, the present code and the present policies."""
 
-import csv
 import json
 import re
 import sys
@@ -22,54 +21,6 @@ from torchmpm.native.cuda.compiler import digest_of_sources  # noqa: E402
 @pytest.mark.parametrize("page", tables.pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_tables_are_current(page):
     assert page.read_text() == tables.refreshed(page.read_text()), "python docs/tables.py writes the tables anew"
-
-
-def test_table_of_evaluations_is_made_of_the_rows_that_exist(tmp_path, monkeypatch):
-    def row(policy, case, mean, particles="lite", noise="with", success="0.5"):
-        about = {"protocol": "v2", "task": "run", "policy": policy, "case": case, "particles": particles}
-        measured = {"noise": noise, "mean": mean, "interval": "100.4", "success": success, "sha256": "a"}
-        return about | measured | ({"sha256": "", "noise": "without"} if policy == "zero" else {})
-
-    rows = [
-        row("zero", "undisturbed", "2000.0"),
-        row("mine", "undisturbed", "12000.0"),
-        row("mine", "latency", "7000.0"),
-        *(row("mine", f"mu x {factor}", mean) for factor, mean in ((0.8, "11000.0"), (1.2, "10000.0"))),
-        row("mine", "own start", "9000.0", "full", success="1.0"),
-        row("mine", "undisturbed", "3000.0", noise="without"),
-    ]
-    monkeypatch.setattr(tables, "DOCS", tmp_path)
-    with (tmp_path / "evaluations.csv").open("w") as file:
-        writer = csv.DictWriter(file, tables.COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-    head, _, *lines = tables.evaluations().splitlines()
-    noisy, quiet = (dict(zip(head.split(" | "), line.split(" | "), strict=True)) for line in lines)
-    assert noisy["policy"] == "`mine`" and quiet["policy"] == "`mine`, mean action"
-    assert noisy["random actions"] == noisy["full"] == ""
-    assert (noisy["return, lite"], quiet["return, lite"]) == ("12,000 ± 100", "3,000 ± 100")
-    assert noisy["success, lite / full"] == "50% / –"
-    assert (noisy["latency"], noisy["matter"], noisy["noise"]) == ("0.50 (0.58)", "0.80 (0.83)", "")
-
-
-def test_options_of_an_algorithm_have_returns_of_their_own(monkeypatch):
-    about = {"task": "run", "particles": "full", "observes": "nothing", "mean": "1", "episodes": "3"}
-    rows = [
-        about | {"algorithm": "`gradient`"},
-        about | {"algorithm": "`gradient --learning-rate 0.1 --polish 90`", "mean": "2", "episodes": "5"},
-    ]
-    monkeypatch.setattr(tables, "read", lambda name: rows if name == "returns.csv" else [])
-    _, _, *lines = tables.returns().splitlines()
-    assert [line.split(" | ")[1:4:2] for line in lines] == [
-        ["`gradient`", "1"],
-        ["`gradient --learning-rate 0.1 --polish 90`", "2"],
-    ]
-
-
-def test_episodes_that_chose_a_policy_are_not_said_to_be_above_the_paper():
-    row = {"mean": "9000.0", "interval": "100.0"}
-    assert tables.compared(row | {"task": "run"}, 8650) == "**9,000 ± 100**"
-    assert tables.compared(row | {"task": "obstacle"}, 8650) == "9,000 ± 100"
 
 
 @pytest.mark.parametrize(

@@ -45,10 +45,15 @@ class Desk:
         change(self.folder / "run")
         self.before = snapshot(self.folder)
 
-    def policy(self, changes: dict | None = None, weights: Callable[[dict], dict] = lambda tensors: tensors) -> None:
+    def policy(
+        self,
+        changes: dict | None = None,
+        weights: Callable[[dict], dict] = lambda tensors: tensors,
+        name: str = "stranger",
+    ) -> None:
         """Write the shipped policy of RUN with another description and other weights."""
         tensors, description = read_policy(SHIPPED / "run.safetensors")
-        write_policy(self.folder / "stranger.safetensors", weights(tensors), {**description, **(changes or {})})
+        write_policy(self.folder / f"{name}.safetensors", weights(tensors), {**description, **(changes or {})})
         self.before = snapshot(self.folder)
 
 

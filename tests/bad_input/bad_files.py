@@ -15,6 +15,8 @@ import baselines.registry
 import cfp
 import cfp.evaluate
 import cfp.train
+from baselines.modular.learner import ModularConfig
+from cfp.agent.actor import ActorSpec
 from cfp.errors import CheckpointError
 from cfp.policy import read_policy, write_policy
 from cfp.train import from_python
@@ -136,6 +138,25 @@ POLICIES = [
             lambda desk: baselines.load(desk.folder / "stranger.safetensors"),
         ),
         ("algo must be one of cfp-analytic",),
+    ),
+]
+
+
+NETWORKS = [
+    *table(
+        (f"network with {given}", partial(ActorSpec, **{"resolutions": (8, 16), "gate_bias": (0.0,)} | given), words)
+        for given, words in (
+            ({"resolutions": (16, 8)}, "resolutions must be increasing"),
+            ({"resolutions": ()}, "resolutions must be increasing"),
+            ({"gate_bias": ()}, "gate_bias must have 1 values"),
+            ({"gate_scale": float("nan")}, "gate_scale must be positive, got nan"),
+            ({"encoder": "large"}, "encoder must be paper or small, got 'large'"),
+            ({"interpolation": "bilinear"}, "interpolation must be half_pixel or aligned, got 'bilinear'"),
+        )
+    ),
+    *table(
+        (f"segments of {algo}", ModularConfig(task="kick", algo=algo).check, ("algo", repr(algo)))
+        for algo in ("gnn", "gnn-x", "mlp-16", "gnn-1")
     ),
 ]
 
@@ -338,4 +359,4 @@ CONFIGS = [
     ),
 ]
 
-CASES = [*IMAGES, *POLICIES, *OPTIONS, *FITS, *PRESETS, *RUNS, *CONFIGS]
+CASES = [*IMAGES, *POLICIES, *NETWORKS, *OPTIONS, *FITS, *PRESETS, *RUNS, *CONFIGS]

@@ -8,6 +8,7 @@ from bad_cases import TINY, Case, Refused, command, prepared
 from cfp.policy import SHIPPED
 
 NEW = " --out {folder}/new "
+RUN = f"{SHIPPED}/run.safetensors"
 SMALL = "--particles 100 --substeps 1 --eval-episodes 1 --no-video --device cpu"
 #: Algorithms whose resets are all seeded.
 SEEDED = ("cfp-analytic", "shac", "gradient", "mpc", "cem", "distill")
@@ -57,6 +58,22 @@ def started(options, *words):
     return laid(f"train after a run {options}", lambda desk: desk.run(), TINY + NEW + start + options, *words)
 
 
+#: Environments of policies that are not those of the programs.
+FASTER, TARGET = {"environment": {"substeps": 50}}, {"environment": {"target": "T", "substeps": 1}}
+
+
+def stranger(program, options, changes, *words, name="stranger"):
+    """A policy of RUN whose description says something else, as the last argument of a program."""
+    module, common = PROGRAMS[program]
+    return laid(
+        f"{program} of a stranger: {words[0]}",
+        lambda desk: desk.policy(changes, name=name),
+        f"{common} {options} {{folder}}/{name}.safetensors",
+        *words,
+        module=module,
+    )
+
+
 TRAIN = [
     *rows(
         "train",
@@ -93,9 +110,11 @@ TRAIN = [
     laid("train into a file", lambda desk: desk.file("new", "mine"), TINY + NEW, "out must be a folder, got the file"),
     laid("train into a run", lambda desk: desk.run(), TINY + " --out {folder}/run", "out: run already holds a run"),
     laid("train under a file", lambda desk: desk.file("new", "mine"), TINY + " --out {folder}/new/run", "out: new/run"),
+    started("", "must be a policy of the first resolutions of (4,), but not all of them without refine, got (4,)"),
     started("--refine --resolutions 8 16", "start_from must be a policy of the first resolutions of (8, 16)"),
     started("--refine --encoder paper", "start_from must be a policy with encoder paper, got small"),
     started("--target T", "start_from must be a policy for the target T, got the default"),
+    laid("resume nothing", lambda desk: None, "--resume --out {folder}/none", "none holds no run to resume; name a"),
     laid("train into a loop", lambda desk: desk.link("loop"), TINY + " --out {folder}/loop", "out: loop cannot be"),
 ]
 
@@ -106,6 +125,7 @@ OTHERS = (
         ("--algo zero", "algo: 'zero' is a reference policy"),
         ("--algo coarse --learner analytic", "learner must not be given"),
         ("--algo gnn-16 --particles 10", "particles of the robot must be at least 16", "got 10"),
+        ("--task kick --algo gnn-64 --particles 63 100", "particles of the robot must be at least 64", "got 63"),
         ("--algo gnn-16 --alpha -1", "alpha must be at least 0, got -1.0"),
         ("--algo gradient --iterations 0", "iterations must be at least 1, got 0"),
         ("--algo gradient --grid 99", "grid must be", "got 99"),
@@ -145,6 +165,7 @@ OTHERS = (
     + rows(
         "distill",
         ("--teacher run", "teacher must be a policy for shapematch"),
+        ("--teacher none", "teacher must be mpc, shac, gradient, catch, dig, "),
         ("--num-layouts 5000", "num_layouts must be at most"),
     )
     + rows(
@@ -152,7 +173,7 @@ OTHERS = (
         ("", "either policy or a folder must be given, got neither"),
         ("{folder} --policy run", "either policy or a folder must be given"),
         ("run", "there is no such folder; --policy run names the policy"),
-        (f"{SHIPPED}/run.safetensors", "run.safetensors names the policy"),
+        (RUN, "run.safetensors names the policy"),
         ("{folder}/none", "none: there is no run (no config.json)"),
         ("{folder}", "there is no run"),
         ("--policy alchemy", "no shipped one has that name"),
@@ -163,6 +184,8 @@ OTHERS = (
         ("--policy alchemy --video a.html", "video must end in .mp4 or .gif or .webp or .png, got a.html"),
         ("--policy alchemy --replay a.mp4", "replay must end in .html, got a.mp4"),
         ("--policy alchemy --video a.mp4 --size 3", "size must be at least 16, got 3"),
+        ("--policy run --dt 3e-4", "dt must divide an environment step"),
+        ("--policy run --dt 0", "dt must be positive"),
         ("--policy run --size 100", "size requires a file"),
         ("--policy run --replay a.html --zoom 3", "zoom requires a file"),
         ("--policy run --episodes 0", "episodes must be at least 1, got 0"),
@@ -196,6 +219,7 @@ OTHERS = (
         "rank",
         ("none", "none: there is no policy"),
         ("none.json", "none.json: cannot be read as JSON"),
+        ("zero --tasks swim", "task must be one of"),
     )
     + [
         laid(
@@ -204,6 +228,18 @@ OTHERS = (
             "run --rows {folder}/other.csv --device cpu",
             "rows: other.csv must be a table with the columns protocol, task",
             module="cfp.robustness",
+        ),
+        stranger("learn", "--algo distill --task run --teacher", TARGET, "teacher: cannot compare its target"),
+        stranger("disturb", "", FASTER, "stranger.safetensors must be a policy for environment steps of 0.01 s"),
+        stranger("disturb", RUN, {"steps": 1}, "names of their own, got two called 'run' on run", name="run"),
+        stranger("rank", "", FASTER, "environment steps of 0.01 s, got 0.005"),
+        stranger("rank", RUN, {"steps": 1}, "names of their own, got two called 'run' on run", name="run"),
+        laid(
+            "policy of a damaged comparison",
+            lambda desk: (desk.policy(), desk.file("comparison.json", "{")),
+            NEW + "{folder}/stranger.safetensors",
+            "comparison.json: cannot be read",
+            module="baselines.leaderboard",
         ),
         planned([1], "plan: plan.json cannot be read as JSON"),
         planned({"colour": 1}, "must hold common, tasks and algos only, got colour"),

@@ -56,18 +56,12 @@ def test_help_shows_what_is_trained_first(capsys):
 def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys):
     code, text, error = output_of(capsys, "train", "--task", "run", "--steps", "0")
     assert (code, text) == (2, "") and error.startswith("error: steps must")
-    code, text, _ = output_of(capsys, "train", "--algo=cem", "--task", "run", "--dry-run", "--out", str(tmp_path / "r"))
-    assert code == 0 and '"algo": "cem"' in text
-
-
-def test_train_takes_the_algorithm_from_a_file_and_its_default_from_cfp(tmp_path, capsys):
     file = tmp_path / "cem.json"
     file.write_text('{"algo": "cem", "task": "run"}')
-    code, text, _ = output_of(capsys, "train", "--config", str(file), "--dry-run")
-    assert code == 0 and json.loads(text)["algo"] == "cem"
-    _, text, _ = output_of(capsys, "train", "--task", "run", "--dry-run")
-    _, also, _ = output_of(capsys, "train", "--task", "run", "--preset", "long", "--dry-run")
-    assert [json.loads(each)["algo"] for each in (text, also)] == ["cfp-analytic", "cfp-sac"]
+    of_file, cem = ("--config", str(file)), ("--algo=cem", "--out", str(tmp_path / "r"))
+    for words, algo in ((cem, "cem"), (of_file, "cem"), ((), "cfp-analytic"), (("--preset", "long"), "cfp-sac")):
+        code, text, _ = output_of(capsys, "train", "--task", "run", *words, "--dry-run")
+        assert code == 0 and json.loads(text)["algo"] == algo
 
 
 def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):

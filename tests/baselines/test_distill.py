@@ -29,16 +29,8 @@ pytestmark = pytest.mark.usefixtures("short")  # SHAPE MATCH only
 
 def options(**changes):
     defaults = {"num_envs": 2, "particles": 300, "substeps": 4, "train_particles": 300, "device": "cpu"}
-    defaults |= {
-        "teacher": "mpc",
-        "horizon": 2,
-        "commit": 2,
-        "iterations": 1,
-        "planner_grid": 4,
-        "resolutions": (8, 16),
-        "encoder": "small",
-    }
-    defaults |= {"rollout_steps": 4, "updates": 2, "batch_size": 8}
+    defaults |= {"teacher": "mpc", "horizon": 2, "commit": 2, "iterations": 1, "planner_grid": 4}
+    defaults |= {"resolutions": (8, 16), "encoder": "small", "rollout_steps": 4, "updates": 2, "batch_size": 8}
     return replace(Distill.preset("run", "quick"), **defaults | changes)
 
 
@@ -286,25 +278,6 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     assert train.main([*TINY, "--teacher", "shac", "--out", str(folder)]) == 0
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()
     assert (folder / "teacher.safetensors").read_bytes() == trained
-
-
-@pytest.mark.parametrize(
-    ("task", "target", "message"),
-    [
-        ("shapematch", "T", "teacher must be a policy for the target star, got T"),
-        ("kick", None, "teacher must be a policy for run, got one for kick"),
-        ("run", "T", "teacher: cannot compare its target"),
-        (None, None, "teacher must be mpc, shac, gradient, catch, dig, "),
-    ],
-)
-def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, target, message):
-    path, folder = tmp_path / "policy.safetensors", tmp_path / "run"
-    if task:
-        config = replace(Distill.preset(task, "quick"), particles=100, substeps=4, target=target)
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, describe_run(config, "gradient", 1, 0))
-    student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
-    assert train.main([*TINY, *student, "--teacher", str(path), "--out", str(folder)]) == 2
-    assert message in capsys.readouterr().err and not folder.exists()
 
 
 @pytest.mark.parametrize(("task", "alike"), [("grow", True), ("shapematch", False)])

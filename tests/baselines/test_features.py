@@ -71,20 +71,22 @@ def test_integrity_counts_what_drifts_apart():
     assert neighbours.drift(torn).item() == pytest.approx(wanted.item())
 
 
+def paid(moved, **changes):
+    """What training pays for a step, with nothing but the changes to its reward."""
+    none = {"reward": "task", "split_weight": 0.0, "integrity_weight": 0.0, "reward_scale": 1.0}
+    return training_reward(replace(Shac.preset("run", "quick"), **none | changes), *moved)
+
+
 def test_speed_is_what_is_paid_for():
     env = reset()
     neighbours, before = Neighbours.find(env.state.x), env.env_state.centre
     env.state.v[..., 0] = 0.5
     _, smooth, _, _, info = env.step(torch.zeros(1, 2, 8, 8), soft=True)
-    plain = replace(Shac.preset("run", "quick"), split_weight=0.0, integrity_weight=0.0, reward_scale=1.0)
-
-    def paid(**changes):
-        return training_reward(replace(plain, **changes), env, before, smooth, info, neighbours)
-
-    assert paid(reward="speed").item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
-    assert paid(reward="speed").item() == pytest.approx(30, rel=0.05)
-    assert paid(reward="task") == smooth
-    lost = smooth - paid(reward="task", split_weight=1000.0, split_margin=0.5)
+    moved = env, before, smooth, info, neighbours
+    assert paid(moved, reward="speed").item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
+    assert paid(moved, reward="speed").item() == pytest.approx(30, rel=0.05)
+    assert paid(moved) == smooth
+    lost = smooth - paid(moved, split_weight=1000.0, split_margin=0.5)
     assert lost.item() == pytest.approx(1000 * (info["split"].item() / env.spec.split_limit - 0.5) ** 2)
 
 
@@ -95,12 +97,8 @@ def test_torn_off_mass_costs_its_share_in_every_step():
     torn[torn[:, 0] > torn[:, 0].quantile(0.7), 0] += 0.1
     neighbours, before = Neighbours.find(env.state.x), env.env_state.centre
     _, smooth, _, _, info = env.step(torch.zeros(2, 2, 8, 8), soft=True)
-    plain = replace(Shac.preset("run", "quick"), reward="task", split_weight=0.0, integrity_weight=0.0)
-
-    def paid(weight):
-        return training_reward(replace(plain, piece_weight=weight), env, before, smooth, info, neighbours)
-
-    cost = paid(0.0) - paid(20.0)
+    moved = env, before, smooth, info, neighbours
+    free, charged = (paid(moved, piece_weight=weight, reward_scale=0.5) for weight in (0.0, 20.0))
     whole, broken = largest_piece(env.state.x, env.env_state.origin)
     assert whole == 1 and broken == pytest.approx(0.7, abs=0.02)
-    assert cost.tolist() == pytest.approx([0.0, plain.reward_scale * 20 * (1 - broken)])
+    assert (free - charged).tolist() == pytest.approx([0.0, 0.5 * 20 * (1 - broken)])

@@ -71,19 +71,12 @@ def test_windows_cut_the_gradient_but_not_the_loss():
     assert not torch.allclose(halves.gradient[:3], whole.gradient[:3], rtol=0.1, atol=1e-9)
 
 
-def test_rewards_with_steps_are_replaced_by_smooth_ones():
-    def ahead(transition, spec):
-        x = transition.robot_x[..., 0].mean(1)
-        return Reward(terms={"ahead": transition.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
+def test_rewards_with_steps_are_replaced_by_smooth_ones(own_task):
+    def ahead(step):
+        x = step.robot_x[..., 0].mean(1)
+        return step.ops.heaviside(x - x.detach() - 1e-3, 1e-3)
 
-    def stepping():
-        return replace(make_spec("run"), name="stepping", reward_fn=ahead, weights={"ahead": 1.0})
-
-    dittogym.register("stepping", stepping)
-    try:
-        episode = shorten(Gradient(make("stepping", substeps=20)), 4).play(0.0)
-    finally:
-        dittogym.TASKS.pop("stepping")
+    episode = shorten(Gradient(make(own_task(ahead), substeps=20)), 4).play(0.0)
     assert episode.gradient.abs().max() > 0 and episode.total == 0.0
 
 

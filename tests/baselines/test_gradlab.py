@@ -1,12 +1,11 @@
 """The benchmark of gradients at growing horizons: against functions whose gradients are known, and as a script."""
 
 import csv
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-import dittogym
 from baselines import train
 from benchmarks.gradlab import COLUMNS, STEP_SIZES, conclude, finite_difference_errors, main, measure, objections
 
@@ -105,12 +104,9 @@ def test_program_measures_up_to_the_end_of_the_episode(tmp_path, capsys) -> None
     assert (tmp_path / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None:
-    outcome = lambda transition, _: dittogym.Reward({"n": transition.now.radius_of_gyration.detach()})  # noqa: E731
-    weights = {"n": 1.0, "action": 2e-4, "split": 1.0}  # whose costs have a gradient
-    counts = replace(dittogym.make_spec("run"), name="count", reward_fn=outcome, weights=weights)
-    monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)
-    options = "--task count --particles 300 --substeps 4 --no-video --out".split()
+def test_task_without_a_gradient_is_named(tmp_path, capsys, own_task) -> None:
+    task = own_task(lambda step: step.now.radius_of_gyration.detach(), action=2e-4, split=1.0)  # costs have a gradient
+    options = f"--task {task} --particles 300 --substeps 4 --no-video --out".split()
     for algo in ("gradient --train-particles 300", "mpc"):
         assert train.main(["--algo", *algo.split(), *options, str(tmp_path / algo[:3])]) == 2
-        assert "'count' has no gradient" in capsys.readouterr().err
+        assert "'own' has no gradient" in capsys.readouterr().err

@@ -14,7 +14,6 @@ from baselines import leaderboard
 from baselines.leaderboard import COUNTS, ENVIRONMENT, SEEDS, TASKS, main, rankings, read_results, scores
 from cfp.agent.actor import build_actor
 from cfp.config import EVALUATION_SEED, LARGEST_SEED
-from cfp.errors import ConfigError
 from cfp.files import write_json
 from cfp.policy import SHIPPED, shipped
 from cfp.presets import preset
@@ -88,38 +87,11 @@ def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     ]
 
 
-def test_different_policies_of_one_name_are_refused(tmp_path, capsys):
-    """Their files of results would have the same name."""
-    config = replace(preset("shapematch", "quick"), **vars(ENVIRONMENT))
-    files = [tmp_path / name / "mine" / "policy.safetensors" for name in ("first", "second")]
-    for file in files:
-        file.parent.mkdir(parents=True)
-        save_actor(file, build_actor(config.actor_spec(1)), config, 1, 0)
-    assert main([*map(str, files), "--out", str(tmp_path / "out")]) == 2
-    assert "policies must have names of their own, got two called 'mine'" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_tasks_without_random_positions_vary_the_particles(tiny, tmp_path):
     assert main(["zero", "--tasks", "obstacle", "--out", str(tmp_path)]) == 0
     returns = read_results(tmp_path / "obstacle-zero.json")["returns"]
     assert returns == pytest.approx([rest("obstacle", 0, count) for count in (100, 90)], abs=1e-2)
-
-
-def test_policies_of_other_tasks_and_damaged_records_are_refused(tmp_path, capsys):
-    config = preset("shapematch", "quick")
-    (tmp_path / "comparison.json").write_text("{")
-    for changes, expected in (
-        ({"target": "T"}, "target of the task, got T"),
-        ({"substeps": 50}, "got 0.005"),
-        ({}, "comparison.json: cannot be read"),
-    ):
-        there = replace(config, **changes)
-        save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
-        assert main([str(tmp_path / "a.safetensors"), "--out", str(tmp_path / "out")]) == 2
-        assert expected in capsys.readouterr().err
-    assert main(["zero", "--tasks", "swim", "--out", str(tmp_path / "out")]) == 2
-    assert "task must be one of" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -146,9 +118,6 @@ def test_wrong_results_are_named(tmp_path, capsys, changes, named):
     write_json(tmp_path / "a.json", VALID | changes)
     assert main([str(tmp_path / "a.json"), "--out", str(tmp_path)]) == 2
     assert f"a.json: {named} must " in capsys.readouterr().err
-    (tmp_path / "a.json").write_text("{")
-    with pytest.raises(ConfigError, match=r"a\.json"):
-        read_results(tmp_path / "a.json")
 
 
 def test_ranks_are_by_mean_return_within_what_is_observed():

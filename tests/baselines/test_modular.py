@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 import baselines
 import dittogym
 from baselines.common.reference_policies import wave
-from baselines.modular.learner import Modular, ModularConfig
+from baselines.modular.learner import Modular
 from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.segments import (
     LENGTH_SCALE,
@@ -299,16 +299,3 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
     policy.save(tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="description"):
         SegmentPolicy.load(tmp_path / "a.safetensors")
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        *(({"algo": algo}, f"algo.*{algo}") for algo in ("gnn", "gnn-x", "mlp-16", "gnn-1")),
-        ({"algo": "gnn-64", "particles": 63}, r"particles.*63"),
-        ({"algo": "gnn-64", "particles": (63, 100)}, r"particles.*63"),
-    ],
-)
-def test_bad_options_are_named(options, named):
-    with pytest.raises(ConfigError, match=named):
-        ModularConfig(task="kick", **options).check()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from policy_files import save_actor
-from stable_baselines3.common.callbacks import BaseCallback
 from watching import at_step, interrupt
 
 import baselines
@@ -165,15 +164,15 @@ def test_polish_is_evaluated_on_the_layout_it_is_made_for(finished):
     assert baselines.load(finished[1]).description["layout"] == 0
 
 
-def test_fit_is_the_command_line(tmp_path):
-    assert run("cem", tmp_path / "command") == 0
+@pytest.mark.parametrize("finished", ["cem"], indirect=True)
+def test_fit_is_the_command_line(finished, tmp_path):
     names = ("grid", "horizon", "commit", "iterations", "candidates", "elites", "eval_every", "checkpoint_every")
     options = dict(zip((*names, "log_every"), (8, 3, 2, 2, 5, 2, 3, 2, 2), strict=True))
     options |= {"particles": 100, "substeps": 1, "eval_episodes": 2, "video": False, "device": "cpu"}
     fitted = baselines.fit("cem", "shapematch", out=tmp_path / "python", **options)
     assert fitted.policy.description["kind"] == "cem" and [row["policy"] for row in fitted.results[2:]] == PLANNED_ROWS
     for name in ("config.json", "evaluations.csv", "results.json"):
-        assert (fitted.folder / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+        assert (fitted.folder / name).read_bytes() == (finished[1] / name).read_bytes(), name
     with pytest.raises(ConfigError, match="algo must be 'cem'"):
         baselines.fit("gnn-16", "shapematch", out=fitted.folder, resume=True)
 
@@ -213,17 +212,6 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path):
     assert baselines.load(tmp_path / "run").description["steps"] == int(best["step"])
 
 
-class StopsAfter(BaseCallback):
-    """Ends the training after some steps of all robots."""
-
-    def __init__(self, steps):
-        super().__init__()
-        self.steps = steps
-
-    def _on_step(self):
-        return self.n_calls < self.steps
-
-
 SHAC = {"train_particles": 100, "num_envs": 2, "window": 4, "critic_updates": 1, "grid": 8}
 SAC = {"num_envs": 2, "batch_size": 4, "buffer_size": 60, "update_start": 8}
 TEACHING = {"teacher": "mpc", "planner_grid": 4, "horizon": 2, "commit": 2, "iterations": 1, "rollout_steps": 4}
@@ -239,9 +227,9 @@ CONFORMS = {
 def test_algorithm_is_one_of_stable_baselines3(name, tmp_path):
     config = configure({"algo": name, "particles": 100, "substeps": 1, "device": "cpu", **CONFORMS[name]})
     model = find(name).create(config, 1, tmp_path)
-    stops = StopsAfter(5)
-    model.learn(100, stops)
-    assert stops.n_calls == 5 and model.num_timesteps == 10
+    calls = []
+    model.learn(100, lambda *_: calls.append("of all robots") or len(calls) < 5)
+    assert len(calls) == 5 and model.num_timesteps == 10
     model.learn(16)
     assert model.num_timesteps == 16
     env = model.get_env()
@@ -275,6 +263,10 @@ def test_presets_are_valid_survive_json_and_agree(task, preset):
         config = configure(values)
         config.check()
         assert configure(json.loads(json.dumps(to_json(config)))) == config, name
+        if name in ("cfp-analytic", "cfp-sac"):
+            stages = range(1, len(config.resolutions) + 1)
+            assert sum(config.stage_steps(stage) for stage in stages) == config.steps
+            assert [config.actor_spec(stage).resolutions[-1] for stage in stages] == list(config.resolutions)
         if find(name).sees in ("image", "state"):  # the others have no noise
             assert config.eval_deterministic == own.eval_deterministic, name
         if isinstance(config, type(own)) or name.startswith(("gnn", "transformer")):

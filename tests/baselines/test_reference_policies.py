@@ -1,26 +1,17 @@
 """Reference policies, and single stages of the coarse-to-fine policy."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 
 from baselines import train
 from baselines.common.reference_policies import REFERENCE_POLICIES, wave
-from baselines.registry import configure, find
-from cfp.agent.actor import build_actor
+from baselines.registry import configure
 from cfp.tables import read_table
 from dittogym.action import patch_field, to_grid_layout
 from dittogym.rewards import action_cost
 
-TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
 IMAGES = np.zeros((2, 3, 64, 64), np.uint8)
-
-
-def trained(algo, folder, *more):
-    assert train.main(["--algo", algo, *TINY, *more, "--out", str(folder)]) == 0
-    return json.loads((folder / "results.json").read_text())
 
 
 def reference(algo, **values):
@@ -59,24 +50,17 @@ def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment():
         assert np.allclose(actions[1], wave(30, 32, "grid")[step])
 
 
-LEARNING = (
-    "--num-envs 2 --random-steps 10 --batch-size 4 --buffer-size 80 --update-start 8 --gradient-steps 1 "
-    "--critics-first 0 --final-rate 1 --eval-every 10 --log-every 10 --checkpoint-every 80"
-).split()
-
-
 @pytest.mark.slow
 def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
     """With one seed the curves of coarse and CFP are the same up to the handover."""
-    trained("coarse", tmp_path / "coarse", *LEARNING, "--resolutions", "4", "--steps", "60")
-    stages = [*LEARNING, "--resolutions", "4", "8", "--random-steps", "10", "4", "--steps", "60", "--handover", "0.667"]
-    trained("cfp-sac", tmp_path / "cfp", *stages)
-    curves = [read_table(tmp_path / name / "evaluations.csv") for name in ("coarse", "cfp")]
+    options = (
+        "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu --num-envs 2 --batch-size 4 --steps 60 "
+        "--buffer-size 80 --update-start 8 --gradient-steps 1 --critics-first 0 --final-rate 1 --eval-every 10 "
+    )
+    two = "--resolutions 4 8 --random-steps 10 4 --handover 0.667"
+    curves = []
+    for algo, stages in (("coarse", "--resolutions 4 --random-steps 10"), ("cfp-sac", two)):
+        assert train.main([*f"--algo {algo} {options} {stages}".split(), "--out", str(tmp_path / algo)]) == 0
+        curves.append(read_table(tmp_path / algo / "evaluations.csv"))
     first = [row for row in curves[1] if row["stage"] == "1"]
     assert len(first) == 4 and curves[0][:4] == first and [row["step"] for row in curves[0][4:]] == ["50", "60"]
-
-
-@pytest.mark.parametrize(("task", "count"), [("run", 82_388), ("shapematch", 83_388)])
-def test_fine_from_scratch_has_the_size_of_the_papers(task, count):
-    spec = find("fine").preset(task, "paper").actor_spec(1)
-    assert sum(parameter.numel() for parameter in build_actor(spec).parameters()) == count

@@ -32,28 +32,18 @@ def update(learner, count=1):
     return learn(learner, count * learner.config.update_every)
 
 
-def counting(transition, spec):
-    return Reward({"far": (transition.now.com[:, 0] > transition.start.com[:, 0]).float()})
-
-
-def test_a_reward_without_gradient_is_noticed(monkeypatch):
-    spec = replace(dittogym.make_spec("run"), name="count", reward_fn=counting, weights={"far": 1.0, "action": 1e-4})
-    monkeypatch.setitem(dittogym.TASKS, "count", lambda: spec)
+def test_a_reward_without_gradient_is_noticed(own_task):
     config = make(reward="task")
-    assert reward_warnings(config) == []
-    assert reward_warnings(replace(config, dtype="float64")) == []
-    assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
+    assert reward_warnings(config) == reward_warnings(replace(config, dtype="float64")) == []
+    counts = own_task(lambda step: (step.now.com[:, 0] > step.start.com[:, 0]).float(), action=1e-4)
+    assert "the reward of own has no gradient in the actions" in reward_warnings(replace(config, task=counts))[0]
 
 
-def without_derivative(transition, spec):
-    x = transition.now.com[:, 0]
-    return Reward({"far": (x - x.detach()).square().sqrt()})  # 0, and its derivative is NaN
-
-
-def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path):
-    spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=without_derivative, weights={"far": 1.0})
-    monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
-    learner = CFPAnalytic.create(replace(make(reward="task"), task="nan"), 1, tmp_path)
+def test_gradients_that_are_never_finite_end_the_training(own_task, tmp_path):
+    task = own_task(
+        lambda step: (step.now.com[:, 0] - step.now.com[:, 0].detach()).square().sqrt()
+    )  # 0, derivative NaN
+    learner = CFPAnalytic.create(replace(make(reward="task"), task=task), 1, tmp_path)
     with pytest.warns(UserWarning, match="most gradients of a window are not finite and were left out"):
         rows = update(learner, 9)
     assert rows[-1]["train/dropped"] == 9 * 4 * 2
@@ -61,15 +51,9 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch, tmp_path)
         update(learner)
 
 
-def undefined(transition, spec):
-    moved = (transition.now.com[:, 1] - transition.start.com[:, 1]).square()
-    return Reward({"far": (-moved).sqrt()})  # NaN once the robot has moved
-
-
-def test_a_reward_that_is_not_finite_ends_the_training(monkeypatch, tmp_path):
-    spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=undefined, weights={"far": 1.0})
-    monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
-    learner = CFPAnalytic.create(replace(make(reward="task"), task="nan"), 1, tmp_path)
+def test_a_reward_that_is_not_finite_ends_the_training(own_task, tmp_path):
+    task = own_task(lambda step: (step.start.com - step.now.com)[:, 1].abs().neg().sqrt())  # NaN once it has moved
+    learner = CFPAnalytic.create(replace(make(reward="task"), task=task), 1, tmp_path)
     with pytest.raises(NonFiniteError, match="the reward function of the task returned NaN"):
         update(learner)
 
@@ -78,11 +62,6 @@ def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
     for train_dt, expected in ((2e-4, (2e-4, 2)), (None, (1e-4, 4))):
         model = CFPAnalytic.create(make(train_dt=train_dt), 1, tmp_path).simulation.model
         assert (model.solver.dt, model.substeps) == expected
-
-
-def go_on(done, infos):
-    """Whether the training goes on after a step."""
-    return True
 
 
 def parameters(module):
@@ -212,6 +191,7 @@ def test_steps_with_success_pay_the_option_and_an_end_with_success_has_its_value
     # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
     config = WindowConfig(task="run", algo="shac", success_reward=2.0, window=1, gamma=0.9, max_episode_steps=10)
     collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
-    window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0, go_on)
+    rest = torch.zeros(2, *env.action_shape)
+    window = collector.collect(lambda _: rest, lambda seen: seen[:, 0] + 7.0, lambda *_: True)
     assert window.rewards.tolist() == [[pytest.approx(paid, abs=1e-6)] * 2]
     assert window.next_values.tolist() == [[pytest.approx(value)] * 2]

@@ -108,6 +108,16 @@ def test_gap_between_chunks_is_noticed(tmp_path):
         ReplayArchive(tmp_path, 1).load(make_ring(), 6, chunks[:2])
 
 
+def test_many_rows_are_several_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr("cfp.experiment.checkpoint.LARGEST_CHUNK", 4)
+    ring, other = make_ring(), make_ring()
+    fill(ring, 0, 5)
+    chunks = ReplayArchive(tmp_path, 1).save(ring, 5)
+    assert [chunk["stop"] - chunk["start"] for chunk in chunks] == [2, 2, 1]
+    ReplayArchive(tmp_path, 1).load(other, 5, chunks)
+    assert_same_ring(ring, other)
+
+
 def test_pruning_deletes_chunks_only(tmp_path):
     """The folder of a stranger's run may be a link to one of mine."""
     mine = tmp_path / "mine"

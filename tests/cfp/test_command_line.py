@@ -36,16 +36,18 @@ def test_command_line_beats_file_beats_preset(tmp_path):
     assert parse("--preset paper --task dig".split()).run == sac_preset("dig", "paper")
 
 
-def test_a_seed_of_zero_names_the_folder_to_resume_where_the_preset_has_another(tmp_path, monkeypatch):
+def test_the_folder_to_resume_follows_from_the_options_that_name_it(tmp_path, monkeypatch):
+    """Also from a seed of zero where the preset has another."""
     monkeypatch.chdir(tmp_path)
     words = "--task catch --preset paper --algo cfp-sac".split()
-    other = parse(words)
-    assert other.run.seed == 2
-    other.out.mkdir(parents=True)
-    (other.out / "config.json").write_text(json.dumps(to_json(other.run)))
-    command = parse([*words, "--seed", "0", "--resume"])
-    assert (command.run.seed, command.out) == (0, Path("runs/cfp-sac-catch-paper-0"))
-    assert parse([*words, "--resume"]).out == other.out
+    begun = replace(parse(words).run, steps=400_000)
+    assert begun.seed == 2
+    (tmp_path / "runs/cfp-sac-catch-paper-2").mkdir(parents=True)
+    (tmp_path / "runs/cfp-sac-catch-paper-2/config.json").write_text(json.dumps(to_json(begun)))
+    for option, seed, steps in (([], 2, 400_000), (["--seed", "2"], 2, 400_000), (["--seed", "0"], 0, 380_000)):
+        command = parse([*words, *option, "--resume"])
+        assert (command.run.seed, command.run.steps) == (seed, steps)
+        assert command.out == Path(f"runs/cfp-sac-catch-paper-{seed}")
 
 
 def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeypatch):

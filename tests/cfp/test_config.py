@@ -1,13 +1,11 @@
 """Options and presets: published values, types, shares of steps, values of stages, environments."""
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
 from policy_files import save_actor
 
-import cfp
 import dittogym
 from cfp.agent.actor import build_actor
 from cfp.analytic.window import Episodes
@@ -18,22 +16,9 @@ from cfp.evaluation.returns import evaluation_seed
 from cfp.presets import PAPER, analytic_preset, sac_preset
 from cfp.registry import configure
 
-PRESETS = [*((name, "cfp-sac") for name in ("quick", "long", "paper")), ("quick", "cfp-analytic")]
-
 
 def sac(**values):
     return configure({"task": "run", "algo": "cfp-sac", **values})
-
-
-@pytest.mark.parametrize("task", PAPER)
-@pytest.mark.parametrize(("name", "algo"), PRESETS)
-def test_every_preset_is_valid_and_survives_json(task, name, algo):
-    config = cfp.preset(task, name, algo)
-    config.check()
-    assert configure(json.loads(json.dumps(to_json(config)))) == config
-    stages = range(1, len(config.resolutions) + 1)
-    assert sum(config.stage_steps(stage) for stage in stages) == config.steps
-    assert [config.actor_spec(stage).resolutions[-1] for stage in stages] == list(config.resolutions)
 
 
 def test_paper_presets_hold_the_published_numbers():
@@ -66,12 +51,6 @@ def test_paper_presets_hold_the_published_numbers():
         assert (config.buffer_size, config.gradient_steps, config.update_start) == (200_000, 1, 256)
         assert config.variant == ("published" if task == "slot" else None)
         assert config.seed == {"catch": 2, "slot": 1}.get(task, 0)
-
-
-def test_quick_learns_by_gradients_and_paper_from_rewards():
-    algos = [cfp.preset("run", *words).algo for words in ((), ("long",), ("paper",), ("quick", "cfp-sac"))]
-    assert algos == ["cfp-analytic", "cfp-sac", "cfp-sac", "cfp-sac"]
-    assert cfp.preset("run").name == "cfp-analytic-run-quick-0"
 
 
 def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):

@@ -13,7 +13,7 @@ from fakes import FakeEnv
 import cfp
 import dittogym
 from cfp import messages
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.errors import NonFiniteError
 from cfp.evaluate import Command
 from cfp.evaluation.page import headline
 from cfp.evaluation.returns import Played, Result, Trial, UntrainedPolicy, evaluate, explain, make_trial
@@ -160,9 +160,6 @@ def test_a_reward_that_is_not_finite_ends_an_evaluation():
 def test_a_policy_can_be_evaluated_with_other_substeps():
     config, _ = Command(policy="run", dt=2e-4).open()
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
-    for dt, message in ((3e-4, "dt must divide an environment step"), (0.0, "dt must be positive")):
-        with pytest.raises(ConfigError, match=f"^{message}"):
-            Command(policy="run", dt=dt).open()
 
 
 def test_the_seed_chooses_the_episodes():

@@ -295,8 +295,12 @@ def test_drawings() -> None:
     """A drawn robot stands where the task's stood; a drawn target is what the reward compares with."""
     y, x = np.mgrid[:128, :128] - 63.5
     played = session("shapematch")
+    played.advance()
+    names = list(played.terms)
+    played.apply(Reset())
+    assert list(played.terms) == names and shown(played).rows.shape == (0, 1 + len(names))
     hello, reset, *_ = played.apply(drawing(np.hypot(x, y) < 30, "target"))
-    assert hello["type"] == "hello" and reset["type"] == "reset"
+    assert (hello["type"], hello["terms"]) == ("hello", names) and reset["type"] == "reset"
     assert played.env.spec.target[32, 32] and not played.env.spec.target[:10].any()
     played.apply(drawing((abs(x) < 40) & (abs(y) < 20), "body"))
     width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
@@ -324,16 +328,6 @@ def test_a_robot_that_does_not_fit_its_place_can_be_scaled_down() -> None:
         assert middles[0] == pytest.approx(middles[1])
         assert played.history.touched == ["a drawn body"]
         played.advance()
-
-
-def test_the_terms_of_the_reward_outlast_resets_and_drawings() -> None:
-    played = session()
-    played.advance()
-    names = list(played.terms)
-    played.apply(Reset())
-    assert list(played.terms) == names and shown(played).rows.shape == (0, 1 + len(names))
-    hello, *_ = played.apply(drawing(np.ones((64, 64)), "body"))
-    assert hello["terms"] == names
 
 
 def test_the_outline_is_that_of_the_tasks_own_robot() -> None:

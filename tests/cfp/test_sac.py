@@ -298,12 +298,18 @@ def test_options_of_stable_baselines3_are_not_given_twice():
             make_model(ActorSpec((8,)), **changes)
 
 
-def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
-    env, gamma = FakeEnv(num_envs=3, resolution=4, horizon=4, end_above=0.203), 0.5
-    options = {"n_steps": 3, "gamma": gamma, "buffer_size": 30, "batch_size": 4, "update_start": 100}
+def sums_ahead():
+    """A learner with sums of three steps, and fifteen rows in a ring of ten."""
+    env = FakeEnv(num_envs=3, resolution=4, horizon=4, end_above=0.203)
+    options = {"n_steps": 3, "gamma": 0.5, "buffer_size": 30, "batch_size": 4, "update_start": 100}
     model = make_model(ActorSpec((4,)), env, random_steps=100, **options)
-    model.learn(45)  # fifteen rows in a ring of ten
-    buffer = model.replay_buffer
+    model.learn(45)
+    return model
+
+
+def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
+    model = sums_ahead()
+    buffer, gamma = model.replay_buffer, 0.5
     assert buffer.full
     batch = buffer.sample(30)
     seen = {}
@@ -326,10 +332,7 @@ def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
 
 
 def test_sums_that_end_early_are_normalised_like_whole_ones(monkeypatch):
-    env, seen = FakeEnv(num_envs=3, resolution=4, horizon=4, end_above=0.203), []
-    options = {"n_steps": 3, "gamma": 0.5, "buffer_size": 30, "batch_size": 4, "update_start": 100}
-    model = make_model(ActorSpec((4,)), env, random_steps=100, **options)
-    model.learn(45)
+    model, seen = sums_ahead(), []
     model.replay_buffer.rewards[:] = 2.0
     model.reward_statistics.mean.fill_(2.0 * (1 + 0.5 + 0.25))
 

@@ -37,9 +37,6 @@ def terminate():
 
 
 def test_run_trains_both_stages_and_leaves_its_files(finished):
-    for name in ("config.json", "results.json", "curve.png", "policy.safetensors", "policy.json", "stage1.json"):
-        assert (finished / name).stat().st_size > 0, name
-    assert list((finished / "tensorboard").glob("events*"))
     progress, evaluations = read_table(finished / "progress.csv"), read_table(finished / "evaluations.csv")
     assert [row["step"] for row in progress] == [str(step) for step in range(10, 151, 10)]
     assert [row["stage"] for row in progress] == ["1"] * 7 + ["2"] * 8
@@ -183,17 +180,6 @@ def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_pat
     assert resume(folder, "--steps", "44") == 2
     assert "steps must be at least 60, those that the run has taken, got 44" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.glob("*.json")} == before
-
-
-def test_the_folder_to_resume_follows_from_the_options_that_name_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert resume("none") == 2
-    assert "none holds no run to resume; name a --task to start one there" in capsys.readouterr().err
-    folder = tmp_path / "runs" / "cfp-sac-shapematch-quick-3"
-    assert run(folder, "--seed", "3", *ONE_STAGE, "--steps", "20") == 0
-    again = parse("--task shapematch --learner sac --seed 3 --resume".split())
-    assert (again.out, again.run.steps) == (folder.relative_to(tmp_path), 20)
-    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):

@@ -43,20 +43,10 @@ def test_conditions_of_a_run():
     config = cfp.preset("run", "quick", "cfp-analytic")
     assert config.vary == 0 and config.conditions(1) is None
     config = replace(config, resolutions=(4, 8), vary=0.5, vary_latency=3, vary_physics=0.1, vary_start=2.0)
-    assert config.conditions(1) == Conditions(
-        latency=(1, 3),
-        action_noise=(0.0, 0.2),
-        action_dropout=(0.0, 0.2),
-        observation_dropout=(0.0, 0.2),
-        mu=(0.9, 1.1),
-        yield_stress=(0.9, 1.1),
-        gravity=(0.9, 1.1),
-        shift=0.02,
-        turn=10.0,
-        velocity=0.1,
-        chance=0.5,
-        grid=4,
-    )
+    shares = dict.fromkeys(("action_noise", "action_dropout", "observation_dropout"), (0.0, 0.2))
+    factors = dict.fromkeys(("mu", "yield_stress", "gravity"), (0.9, 1.1))
+    start = {"shift": 0.02, "turn": 10.0, "velocity": 0.1}
+    assert config.conditions(1) == Conditions(latency=(1, 3), **shares, **factors, **start, chance=0.5, grid=4)
     assert config.conditions(2) == replace(config.conditions(1), grid=8)
     assert replace(config, vary_latency=0).conditions(1).latency == (0, 0)
 
