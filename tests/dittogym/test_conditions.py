@@ -54,23 +54,6 @@ def test_the_numbers_are_those_of_splitmix() -> None:
             assert found.tolist() == expected
 
 
-def test_numbers_are_uniform_and_independent() -> None:
-    """Of neighbouring seeds, streams, steps and entries: means, variances and correlations to five deviations."""
-    numbers = torch.stack(
-        [drawing.uniform(torch.arange(40), stream, step, 40) for stream in range(6) for step in range(40)]
-    ).view(6, 40, 40, 40)
-    numbers = (numbers.double() - 0.5) * math.sqrt(12)
-    assert abs(numbers.mean()) < 5 / math.sqrt(numbers.numel())
-    assert abs(numbers.square().mean() - 1) < 5 * math.sqrt(0.8 / numbers.numel())
-    for axis in range(4):
-        for lag in (1, 2):
-            size = numbers.shape[axis] - lag
-            products = numbers.narrow(axis, 0, size) * numbers.narrow(axis, lag, size)
-            assert abs(products.mean()) < 5 / math.sqrt(products.numel()), (axis, lag)
-    along = torch.histc(numbers, 16, -math.sqrt(3), math.sqrt(3))
-    assert ((along - along.mean()).abs() < 5 * along.mean().sqrt()).all()
-
-
 # What episodes draw.
 
 

@@ -154,12 +154,3 @@ def test_packed_numbers_are_the_same() -> None:
     found = copies.unpack(copies.pack(given).numpy(), given)
     assert_same_bits(found, given)
     assert all(array.flags.writeable and array.flags.aligned for array in found.values())
-
-
-def test_constants_are_shared() -> None:
-    like = torch.zeros(1, dtype=torch.float64)
-    point = copies.constant((0.1, 0.2), like)
-    assert point is copies.constant([0.1, 0.2], like) and point.tolist() == [0.1, 0.2]
-    assert copies.constant(np.float32(0.1), torch.zeros(1)).dtype == torch.float32
-    picture = np.eye(3, dtype=bool)
-    assert copies.constant(picture, like).sum() == 3 and copies.constant(picture, like > 0).dtype == torch.bool
