@@ -88,19 +88,6 @@ def test_observations_are_area_means(size: int) -> None:
 # Gymnasium's wrappers.
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_record_episode_statistics_of_a_batch(mode: str) -> None:
-    env = wrappers.vector.RecordEpisodeStatistics(batch(max_episode_steps=3, autoreset_mode=mode))
-    env.reset(seed=0)
-    rewards = []
-    for _ in range(3):
-        _, reward, _, truncated, info = env.step(np.ones(env.action_space.shape, np.float32))
-        rewards.append(reward)
-    assert truncated.all() and info["_episode"].all()
-    assert info["episode"]["l"].tolist() == [3, 3]
-    assert info["episode"]["r"] == pytest.approx(np.sum(rewards, axis=0), abs=1e-4)
-
-
 def test_truth_values_are_those_of_python() -> None:
     """Gymnasium's vector environments would keep NumPy's as objects; its conversions to other arrays refuse them."""
     env = gymnasium.make("dittogym/catch-coarse-v0", **SMALL)
@@ -111,24 +98,6 @@ def test_truth_values_are_those_of_python() -> None:
     several.reset(seed=0)
     info = several.step(several.action_space.sample())[4]
     assert info["finite"].dtype == info["is_success"].dtype == bool
-
-
-def test_conversion_to_torch() -> None:
-    pytest.importorskip("array_api_compat")
-    env = wrappers.NumpyToTorch(gymnasium.make("dittogym/catch-coarse-v0", **SMALL))
-    info = env.reset(seed=0)[1]
-    assert info["finite"].dtype == torch.bool
-
-
-def test_gymnasiums_own_vector_environments() -> None:
-    env = gymnasium.make_vec(NAME, num_envs=2, vectorization_mode="sync", **SMALL)
-    ours = batch()
-    assert np.array_equal(env.reset(seed=4)[0], ours.reset(seed=4)[0])
-    action = np.ones(env.action_space.shape, np.float32)
-    theirs, results = env.step(action), ours.step(action)
-    assert np.array_equal(theirs[0], results[0]) and theirs[1] == pytest.approx(results[1], abs=1e-5)
-    assert theirs[4]["com"] == pytest.approx(results[4]["com"], abs=1e-6)
-    assert set(results[4]) == set(theirs[4])
 
 
 @pytest.fixture
