@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from tiny import TASKS, actions, on_edge, tiny
+from tiny import ALL, TASKS, actions, on_edge, tiny
 
 import dittogym
 from dittogym.conditions import act, seen
@@ -51,23 +51,10 @@ def test_a_recorded_step_is_the_same(task: str) -> None:
     assert ours._replayed is not None and ours._replayed.failure is None
 
 
-#: Every kind of condition.
-CONDITIONS = {
-    "latency": (0, 2),
-    "action_noise": 0.1,
-    "action_dropout": 0.2,
-    "observation_dropout": 0.2,
-    "mu": (0.8, 1.2),
-    "turn": 5.0,
-    "velocity": 0.1,
-    "grid": 4,
-}
-
-
 def test_conditions_are_those_of_the_cpu() -> None:
     """Draws agree, and images lose the same entries; the recorded step is the same."""
-    ours = on_cuda("run", conditions=CONDITIONS)
-    cpu = tiny("run", 3, particles=600, dtype="float32", conditions=CONDITIONS)
+    ours = on_cuda("run", conditions=ALL)
+    cpu = tiny("run", 3, particles=600, dtype="float32", conditions=ALL)
     cpu.reset(seed=0)
     for name, value in cpu.env_state.conditions.items():
         assert (ours.env_state.conditions[name].cpu() - value).abs().max() <= 1e-6
@@ -85,7 +72,7 @@ def test_conditions_are_those_of_the_cpu() -> None:
 
 @torch.no_grad()
 def test_a_disturbed_step_is_recorded_and_waits_for_nothing() -> None:
-    ours, theirs = (on_cuda("run", conditions=CONDITIONS) for _ in range(2))
+    ours, theirs = (on_cuda("run", conditions=ALL) for _ in range(2))
     theirs._replayed = None
     for given in actions(ours, WARM_UP + 4).to("cuda"):
         assert equal(ours.step(given), theirs.step(given)) and equal(ours.env_state, theirs.env_state)

@@ -92,18 +92,6 @@ def test_a_constant_of_a_reset_acts_as_that_of_the_task(name: str) -> None:
             torch.testing.assert_close(ours[i], theirs[0], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("dt", "largest"), [(1e-4, 781_250.0), (2e-4, 195_312.5)])
-def test_gravity_has_a_limit_that_depends_on_the_substeps(dt: float, largest: float) -> None:
-    """Beyond it a particle at rest crosses a cell within a substep."""
-    env = tiny("run", 1, dt=dt, substeps=1)
-    given(env, gravity=(0.0, -0.99 * largest))
-    with pytest.raises(ValueError, match=rf"^physics\['gravity'\].* must be above -{largest}"):
-        given(env, gravity=(0.0, -1.01 * largest))
-    with pytest.raises(ValueError, match=rf"^gravity.* must be below {largest}"):
-        spec = replace(dittogym.make_spec("run"), gravity=(2 * largest, 0.0))
-        TorchEnv(spec, 1, dt=dt, substeps=1)
-
-
 # How long they hold.
 
 

@@ -73,6 +73,18 @@ def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
         env.state.v[i] += torch.randn(env.state.v[i].shape, generator=generator, dtype=torch.float64).to(env.dtype)
 
 
+@torch.no_grad()
+def episode(env: dittogym.TorchEnv, seed: int) -> list[Any]:
+    """All that a batch of two shows and is over a few steps, one of them reset on the way."""
+    rows: list[Any] = [env.reset(seed=seed)]
+    stir(env, seed)
+    for t, action in enumerate(actions(env, 4, seed)):
+        if t == 2:
+            rows.append(env.reset(options={"reset_mask": [True, False]}))
+        rows += [env.step(action), everything(env)]
+    return rows
+
+
 def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:
     """Put other values in place of fields of the particles."""
     env.env_state = replace(env.env_state, particles=replace(env.state, **fields))
