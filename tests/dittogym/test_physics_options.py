@@ -150,8 +150,9 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
             assert float(str(raised.value).split()[5]) == pytest.approx(limit, rel=1e-6)
     assert env.state is before
     env.reset(options={"physics": {"mu": 3000.0}})
-    with pytest.raises(ValueError, match="dt must be at most"):
-        tiny(replace(dittogym.make_spec("run"), mu=9000.0))
+    for own, words in (({"mu": 9000.0}, "dt must be at most"), ({"gravity": (2e6, 0.0)}, "^gravity")):
+        with pytest.raises(ValueError, match=words):
+            tiny(replace(dittogym.make_spec("run"), **own))
     kick = dittogym.make_spec("kick")
     hard = replace(kick.objects[0], material=torchmpm.Elastic(2e4, 100.0))
     with pytest.raises(ValueError, match="of the object"):

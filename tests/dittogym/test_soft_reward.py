@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
+from tiny import TASKS, actions, assert_same_bits, everything, normal, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, core
@@ -17,10 +17,6 @@ from dittogym.tasks.slot import FALLEN, FAR_SIDE
 
 #: Tasks whose reward looks at velocities.
 WITH_SPEED = ("run", "kick", "dig", "obstacle", "slot")
-
-
-def normal(*shape: int, seed: int = 1) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def reward(env: TorchEnv, state: EnvState, soft: bool = False) -> Tensor:
@@ -60,7 +56,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
 def test_gradient_at_thresholds_against_central_differences(task: str, name: str) -> None:
     env, *given = at_threshold(task)
     which = ("x", "v").index(name)
-    leaf, direction = given[which].requires_grad_(), normal(*given[which].shape) + 1.0
+    leaf, direction = given[which].requires_grad_(), normal(*given[which].shape, seed=1) + 1.0
 
     def total(value: Tensor) -> Tensor:
         values = [value if i == which else t for i, t in enumerate(given)]
@@ -175,7 +171,7 @@ def test_soft_choice_of_the_nearest() -> None:
 
 
 def test_distances_of_particles_and_of_averages() -> None:
-    x, point = normal(3, 5, 2), normal(3, 2, seed=2)
+    x, point = normal(3, 5, 2, seed=1), normal(3, 2, seed=2)
     expected = (x - point[:, None]).norm(dim=-1)
     torch.testing.assert_close(distance(x, point), expected)
     torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])

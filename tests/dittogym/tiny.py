@@ -59,6 +59,11 @@ def on_edge(env: dittogym.TorchEnv) -> torch.Tensor:
     return (gap > 0) & (gap < 2e-3)  # empty space is exact
 
 
+def normal(*shape: int, seed: int) -> torch.Tensor:
+    """Normally distributed numbers."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
 def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
     """Random actions (steps, B, 2, R, R)."""
     generator = torch.Generator().manual_seed(seed)
@@ -69,8 +74,7 @@ def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
 def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
     """Give element i the random velocities of ``seed + i``, about 1 m/s, so that things happen within few substeps."""
     for i in range(env.num_envs):
-        generator = torch.Generator().manual_seed(seed + i)
-        env.state.v[i] += torch.randn(env.state.v[i].shape, generator=generator, dtype=torch.float64).to(env.dtype)
+        env.state.v[i] += normal(*env.state.v[i].shape, seed=seed + i).to(env.dtype)
 
 
 @torch.no_grad()
