@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from tiny import SMALL, make_vec
+from tiny import SMALL, begun, make_vec
 
 import dittogym
 
@@ -93,8 +93,7 @@ def test_a_batch_does_what_gymnasiums_own_vector_environment_does(mode: str, res
 
 
 def test_a_batch_without_a_time_limit() -> None:
-    vector = make_vec("shapematch", max_episode_steps=-1, substeps=1)
-    vector.reset(seed=0)
+    vector = begun(make_vec("shapematch", max_episode_steps=-1, substeps=1))
     assert not any(vector.step(vector.action_space.sample())[3].any() for _ in range(31))
 
 
@@ -104,8 +103,7 @@ def test_the_step_in_which_an_element_is_reset_has_no_reward() -> None:
         return dittogym.Reward({"risen": torch.where(moved, torch.inf, 0.0)})
 
     spec = replace(dittogym.make_spec("run"), reward_fn=reward_fn, weights={"risen": 1.0}, horizon=1)
-    envs = dittogym.BatchEnv(spec, 2, **SMALL)
-    envs.reset(seed=0)
+    envs = begun(dittogym.BatchEnv(spec, 2, **SMALL))
     action = np.zeros(envs.action_space.shape, np.float32)
     assert [envs.step(action)[1].tolist() for _ in range(2)] == [[np.inf, np.inf], [0.0, 0.0]]
 

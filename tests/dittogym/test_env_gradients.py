@@ -10,7 +10,7 @@ from functools import cache
 
 import pytest
 import torch
-from tiny import actions, normal, set_particles, tiny
+from tiny import actions, begun, normal, set_particles, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, make_spec
@@ -45,8 +45,7 @@ def environment(task: str, backend: str, segment: int | None = None) -> TorchEnv
 @cache
 def inputs(task: str) -> Leaves:
     """Everything that a loss may be differentiated in."""
-    env = environment(task, "eager")
-    env.reset(seed=3)
+    env = begun(environment(task, "eager"), seed=3)
     n, spec = env.num_particles, make_spec(task)
     own = {name: getattr(spec, name) for name in MATTER if name != "mass"} | {"mass": 1.0}
     matter = {name: own[name] * (1.0 + 0.1 * normal(B, seed=k).abs()) for k, name in enumerate(MATTER)}

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from tiny import ALL, TASKS, actions, on_edge, tiny
+from tiny import ALL, TASKS, actions, begun, on_edge, tiny
 
 import dittogym
 from dittogym.conditions import act, seen
@@ -29,8 +29,7 @@ def without_waiting() -> Iterator[None]:
 
 
 def on_cuda(task: str, **options: object) -> dittogym.TorchEnv:
-    env = tiny(task, 3, particles=600, dtype="float32", device="cuda", **options)
-    env.reset(seed=0)
+    env = begun(tiny(task, 3, particles=600, dtype="float32", device="cuda", **options))
     return env
 
 
@@ -54,8 +53,7 @@ def test_a_recorded_step_is_the_same(task: str) -> None:
 def test_conditions_are_those_of_the_cpu() -> None:
     """Draws agree, and images lose the same entries; the recorded step is the same."""
     ours = on_cuda("run", conditions=ALL)
-    cpu = tiny("run", 3, particles=600, dtype="float32", conditions=ALL)
-    cpu.reset(seed=0)
+    cpu = begun(tiny("run", 3, particles=600, dtype="float32", conditions=ALL))
     for name, value in cpu.env_state.conditions.items():
         assert (ours.env_state.conditions[name].cpu() - value).abs().max() <= 1e-6
     state, image = cpu.env_state.conditions, torch.ones(3, 3, 64, 64)
@@ -113,8 +111,7 @@ def test_another_stream() -> None:
 @pytest.mark.parametrize("particles", ["lite", "full"])
 @torch.no_grad()
 def test_the_kernel_draws_what_torch_does(task: str, particles: str) -> None:
-    env = dittogym.TorchEnv(task, 2, particles=particles, device="cuda")
-    env.reset(seed=0)
+    env = begun(dittogym.TorchEnv(task, 2, particles=particles, device="cuda"))
     env.step(torch.ones(2, *env.action_shape, device="cuda"))
     state, camera = env.env_state, env.model.camera
     arrays = state.particles.x, state.particles.v, state.origin, state.centre

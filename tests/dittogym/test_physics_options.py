@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import actions, assert_same_bits, stir, tiny
+from tiny import actions, assert_same_bits, begun, stir, tiny
 
 import dittogym
 import torchmpm
@@ -22,8 +22,7 @@ def given(env: TorchEnv, **physics: object) -> TorchEnv:
 
 def test_numbers_and_lists_are_as_exact_as_arrays() -> None:
     """torch would make them float32, or whatever its default is, first."""
-    env = tiny("kick", 2)
-    env.reset(seed=0)
+    env = begun(tiny("kick", 2))
     places = (env.state.x[0] + 1e-12).tolist()
     for default in (torch.float32, torch.bfloat16):
         torch.set_default_dtype(default)
@@ -139,8 +138,7 @@ def test_only_masked_elements_change() -> None:
 
 def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     """By the task's numbers, muscles included; the batch goes on as it was."""
-    env = tiny("run", 2)
-    env.reset(seed=0)
+    env = begun(tiny("run", 2))
     before = env.state
     limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
     for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):

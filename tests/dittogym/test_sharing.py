@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, assert_same_bits, everything, leaves, tiny
+from tiny import SMALL, assert_same_bits, begun, everything, leaves, tiny
 
 from dittogym.env import Env
 from dittogym.vector import BatchEnv
@@ -65,8 +65,7 @@ def test_what_is_given_and_returned_may_be_written_to(name: str) -> None:
 
 
 def test_an_action_that_is_ignored_stays_as_it_was() -> None:
-    env = BatchEnv("run", 2, max_episode_steps=1, **SMALL)
-    env.reset(seed=0)
+    env = begun(BatchEnv("run", 2, max_episode_steps=1, **SMALL))
     action = np.full(env.action_space.shape, 0.5, np.float32)
     env.step(action)
     ignored = np.full_like(action, np.nan)  # both elements begin anew

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, everything, make_vec, stir, tiny
+from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, begun, everything, make_vec, stir, tiny
 
 from dittogym import TorchEnv, make_spec
 from dittogym.snapshots import Snapshot
@@ -59,8 +59,7 @@ def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str, conditi
 def test_through_gymnasium(mode: str | None) -> None:
     """The future from a moment, behind all wrappers, and of a batch in each mode."""
     single = gymnasium.make("dittogym/catch-coarse-v0", **SMALL)
-    env = single if mode is None else make_vec("catch", autoreset_mode=mode)
-    env.reset(seed=2)
+    env = begun(single if mode is None else make_vec("catch", autoreset_mode=mode), seed=2)
     env.action_space.seed(0)
     drive = [env.action_space.sample() for _ in range(2 + STEPS)]
     seen = [env.step(action) for action in drive[:2]][-1][0]
@@ -74,8 +73,7 @@ def test_through_gymnasium(mode: str | None) -> None:
 
 def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
     """Its reset, due in the next call, is off; the step count of the moment is back."""
-    env = make_vec(max_episode_steps=3)
-    env.reset(seed=0)
+    env = begun(make_vec(max_episode_steps=3))
     action = np.ones(env.action_space.shape, np.float32)
     env.step(action)
     env.step(action)
@@ -165,8 +163,7 @@ def test_a_snapshot_fits_functions_with_the_same_arguments() -> None:
         reward_fn = partial(
             lambda transition, spec, factor: make_spec("run").reward_fn(transition, spec), factor=factor
         )
-        env = tiny(replace(spec, reward_fn=reward_fn), 2)
-        env.reset(seed=0)
+        env = begun(tiny(replace(spec, reward_fn=reward_fn), 2))
         return env
 
     scaled(2.0).load(scaled(2.0).save())
@@ -219,8 +216,7 @@ def test_learned_materials_are_no_part_of_what_a_moment_must_fit() -> None:
         for mu in (650.0, 700.0):
             matter = VonMises(torch.tensor(mu, requires_grad=learns), 50.0, 90.0)
             spec = make_spec("run")
-            env = tiny(replace(spec, robot=replace(spec.robot, material=matter)))
-            env.reset(seed=0)
+            env = begun(tiny(replace(spec, robot=replace(spec.robot, material=matter))))
             env.step(actions(env, 1)[0])
             moments.setdefault(learns, []).append((env, env.save()))
     (_, before), (env, _) = moments[True]
@@ -235,12 +231,10 @@ def test_learned_materials_are_no_part_of_what_a_moment_must_fit() -> None:
 def test_materials_on_a_device() -> None:
     spec = make_spec("run")
     matter = VonMises(torch.tensor(650.0, device="cuda"), 50.0, 90.0)
-    env = tiny(replace(spec, robot=replace(spec.robot, material=matter)), device="cuda")
-    env.reset(seed=0)
+    env = begun(tiny(replace(spec, robot=replace(spec.robot, material=matter)), device="cuda"))
     env.load(env.save())
 
 
 def test_representations_are_short() -> None:
-    env = tiny("run", 2)
-    env.reset(seed=0)
+    env = begun(tiny("run", 2))
     assert all(len(repr(thing)) < 200 for thing in (env.env_state, env.save(), env.spec))

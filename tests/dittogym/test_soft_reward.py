@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tiny import TASKS, actions, assert_same_bits, everything, normal, stir, tiny
+from tiny import TASKS, actions, assert_same_bits, begun, everything, normal, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, core
@@ -33,8 +33,7 @@ def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
 
 def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     """A task with the first simulation where its reward jumps or bends, and random velocities."""
-    env = tiny(task, 2)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2))
     stir(env)
     x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
@@ -105,8 +104,7 @@ def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
 @torch.no_grad()
 def test_gap_from_rest(task: str) -> None:
     """Away from thresholds the soft reward is the true one; SHAPE MATCH counts pixels, and CATCH and SLOT particles."""
-    env = tiny(task, 2, particles=2000)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2, particles=2000))
     gap = (reward(env, env.env_state, soft=True) - reward(env, env.env_state)).abs().max()
     bounds = {"shapematch": 2.5, "catch": 0.15, "slot": 0.6}
     assert gap <= bounds.get(task, 0.01)
@@ -115,8 +113,7 @@ def test_gap_from_rest(task: str) -> None:
 @pytest.mark.parametrize("task", ["shapematch", "slot", "run"])
 def test_step_with_soft_rewards(task: str) -> None:
     """The same simulation, judged twice; the gradient reaches back through several steps."""
-    env, plain = tiny(task, 2, resolution=8), tiny(task, 2, resolution=8)
-    env.reset(seed=0), plain.reset(seed=0)
+    env, plain = begun(tiny(task, 2, resolution=8)), begun(tiny(task, 2, resolution=8))
     drive = (0.5 * actions(env, 2)).requires_grad_()
     total = torch.zeros(2, dtype=env.dtype)
     for action in drive:

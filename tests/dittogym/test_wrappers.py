@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import wrappers
-from tiny import SMALL, make_vec
+from tiny import SMALL, begun, make_vec
 from torch.nn.functional import interpolate
 
 from dittogym.wrappers import action_resolution, observation_resolution
@@ -94,8 +94,7 @@ def test_truth_values_are_those_of_python() -> None:
     for info in (env.reset(seed=0)[1], env.step(env.action_space.sample())[4]):
         assert {name for name, value in info.items() if isinstance(value, bool)} == {"finite", "is_success"} & {*info}
         assert not any(isinstance(value, np.bool_) for value in info.values())
-    several = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("dittogym/catch-coarse-v0", **SMALL)] * 2)
-    several.reset(seed=0)
+    several = begun(gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("dittogym/catch-coarse-v0", **SMALL)] * 2))
     info = several.step(several.action_space.sample())[4]
     assert info["finite"].dtype == info["is_success"].dtype == bool
 
@@ -109,8 +108,7 @@ def pygame(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_window_on_the_screen_shows_the_picture(pygame) -> None:
-    env = single(render_mode="human")
-    env.reset(seed=0)
+    env = begun(single(render_mode="human"))
     for _ in range(2):
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
         assert np.array_equal(shown[50:], env.unwrapped.torch_env.render()[50:])  # below caption and legend
@@ -134,8 +132,7 @@ def test_the_window_pauses_steps_and_closes(pygame) -> None:
         assert len(waiting) == left
         press(*(event.key for event in waiting))
     for closing in (pygame.event.Event(pygame.KEYDOWN, key=pygame.K_q), pygame.event.Event(pygame.QUIT)):
-        env = single(render_mode="human")
-        env.reset(seed=0)
+        env = begun(single(render_mode="human"))
         pygame.event.post(closing)
         env.step(action)
         assert not env.unwrapped.window_open and not pygame.display.get_init()
@@ -147,8 +144,7 @@ def test_a_real_video(tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # moviepy's
-        env = wrappers.RecordVideo(single(render_mode="rgb_array", max_episode_steps=3), str(tmp_path))
-        env.reset(seed=0)
+        env = begun(wrappers.RecordVideo(single(render_mode="rgb_array", max_episode_steps=3), str(tmp_path)))
         for _ in range(3):
             env.step(np.zeros(env.action_space.shape, np.float32))
         env.close()

@@ -47,6 +47,12 @@ def make_vec(task: str = "run", num_envs: int = 2, **options: Any) -> gymnasium.
     return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
 
 
+def begun(env: Any, seed: int = 0) -> Any:
+    """The environment after a reset."""
+    env.reset(seed=seed)
+    return env
+
+
 def on_edge(env: dittogym.TorchEnv) -> torch.Tensor:
     """Entries of the picture that rounding of the sums may bring to either of two bytes, (B, 3, 64, 64) bool.
 
