@@ -14,7 +14,8 @@ import numpy as np
 import reference
 import torch
 
-from dittogym import make_spec
+import dittogym
+from dittogym import core, make_spec
 from dittogym.action import patch_field, place
 from dittogym.geometry import centre_in_window
 from torchmpm.boundary import constrain
@@ -105,17 +106,20 @@ def extract(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
-def make(data: dict[str, np.ndarray]) -> reference.ReferenceEnv:
+def make(data: dict[str, np.ndarray]) -> dittogym.Env:
     """The environment that a file was recorded with, after a reset."""
     config = json.loads(str(data["config"]))
     task, resolution = config["task"].split("-")
     dtype = "float64" if config["f64"] else "float32"
     env = reference.make(task, resolution, particles=tuple(config["particle_num_list"]), dtype=dtype)
-    env.reset(seed=0, options={"positions": data["x0"]} if "x0" in data else None)
+    env.reset(seed=0)
+    if "x0" in data:  # one recording parks particles that it does not need outside the window
+        inner = env.torch_env
+        inner.env_state, _ = core.reset(inner.model, torch.as_tensor(data["x0"])[None].to(inner.state.x))
     return env
 
 
-def action(data: dict[str, np.ndarray], env: reference.ReferenceEnv, step: int) -> np.ndarray:
+def action(data: dict[str, np.ndarray], env: dittogym.Env, step: int) -> np.ndarray:
     return data["actions"][step].reshape(env.action_space.shape)
 
 
@@ -139,7 +143,7 @@ def substep_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     return errors
 
 
-def _first_grid(data: dict[str, np.ndarray], env: reference.ReferenceEnv, recorded: torch.Tensor) -> dict[str, float]:
+def _first_grid(data: dict[str, np.ndarray], env: dittogym.Env, recorded: torch.Tensor) -> dict[str, float]:
     """Actuation, mass and velocity on the nodes in the first substep."""
     spec, solver, start = env.torch_env.spec, env.torch_env.model.solver, env.torch_env.env_state
     first = torch.as_tensor(action(data, env, 0))[None].to(env.state.x)

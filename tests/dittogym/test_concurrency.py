@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
+from tiny import TASKS, actions, assert_same_bits, episode, tiny
 
-from dittogym import TorchEnv
 from torchmpm.native.library import find_compiler
 
 BACKENDS = ["eager", pytest.param("native", marks=pytest.mark.skipif(not find_compiler(), reason="no C++ compiler"))]
@@ -47,16 +46,6 @@ if __name__ == "__main__":
     for backend in ("auto", "eager"):
         compare(sys.argv[1], backend)
 """
-
-
-def episode(env: TorchEnv, seed: int) -> list:
-    """All that an environment shows and is over a few steps, without gradients."""
-    with torch.no_grad():
-        rows: list = [env.reset(seed=seed)]
-        stir(env, seed)
-        for action in actions(env, 4, seed):
-            rows += [env.step(action), everything(env)]
-    return rows
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

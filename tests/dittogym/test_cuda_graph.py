@@ -13,7 +13,7 @@ import pytest
 import torch
 from device_operators import DeviceOperators
 from test_device import on_a_gpu
-from tiny import TASKS, actions, assert_same_bits, everything, forget, tiny
+from tiny import TASKS, actions, assert_same_bits, begun, everything, forget, tiny
 from torch.utils._python_dispatch import _disable_current_modes
 
 from dittogym import TorchEnv, action, core
@@ -85,8 +85,7 @@ def test_a_replay_changes_nothing(task: str, conditions: Any) -> None:
 
 @torch.no_grad()
 def test_results_belong_to_the_caller() -> None:
-    env = recorded(tiny("kick", 2))
-    env.reset(seed=0)
+    env = begun(recorded(tiny("kick", 2)))
     for given in actions(env, WARM_UP + 2):
         env.step(given)
     step, state = env.step(actions(env, 1)[0]), env.env_state
@@ -99,8 +98,7 @@ def test_results_belong_to_the_caller() -> None:
 
 
 def test_gradients_are_not_recorded() -> None:
-    env = recorded(tiny("run", 2))
-    env.reset(seed=0)
+    env = begun(recorded(tiny("run", 2)))
     given = actions(env, 1)[0].requires_grad_()
     for _ in range(WARM_UP + 2):
         reward = env.step(given)[1]
@@ -133,8 +131,7 @@ def test_what_cannot_be_recorded_is_called(caplog: pytest.LogCaptureFixture) -> 
 @torch.no_grad()
 def test_a_recording_keeps_the_constants_that_it_reads() -> None:
     forget(action.bicubic_matrix)
-    env = recorded(tiny("run", 2))
-    env.reset(seed=0)
+    env = begun(recorded(tiny("run", 2)))
     for given in actions(env, WARM_UP + 2):
         env.step(given)
     shape = env.action_resolution, env.spec.patch
@@ -149,8 +146,7 @@ def test_a_recording_keeps_the_constants_that_it_reads() -> None:
 
 @torch.no_grad()
 def test_a_copy_of_an_environment_records_anew() -> None:
-    env = recorded(tiny("run", 2))
-    env.reset(seed=0)
+    env = begun(recorded(tiny("run", 2)))
     for given in actions(env, WARM_UP + 2):
         env.step(given)
     twin = copy.deepcopy(env)
@@ -175,8 +171,7 @@ def test_a_pointer_is_a_use() -> None:
 @torch.no_grad()
 def test_few_launches_around_the_physics(task: str) -> None:
     """Once a step is replayed, what is left are copies, checks and the task's own reward."""
-    env = recorded(on_a_gpu(tiny(task, 3)))
-    env.reset(seed=0)
+    env = begun(recorded(on_a_gpu(tiny(task, 3))))
     for given in actions(env, WARM_UP + 2):
         with DeviceOperators() as seen:
             env.step(given)

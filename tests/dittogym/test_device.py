@@ -13,7 +13,7 @@ import pytest
 import torch
 from device_operators import DeviceOperators
 from stable_baselines3.common.vec_env import VecEnv
-from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, make_vec, tiny
+from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, begun, make_vec, tiny
 
 from cfp.envs.vec_env import TorchVecEnv
 from dittogym import TorchEnv, copies, core
@@ -66,8 +66,7 @@ def test_what_would_not_wait_is_only_counted() -> None:
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("task", TASKS)
 def test_a_step_waits_for_nothing(task: str, soft: bool, conditions: Any) -> None:
-    env = on_a_gpu(tiny(task, 3, conditions=conditions))
-    env.reset(seed=0)
+    env = begun(on_a_gpu(tiny(task, 3, conditions=conditions)))
     action = actions(env, 1)[0].requires_grad_(soft)
     env.step(action, soft=soft)
     with DeviceOperators() as seen:
@@ -95,8 +94,7 @@ def test_a_reset_waits_for_its_mask_alone(task: str, physics: dict[str, Any] | N
 
 
 def test_an_action_that_is_not_finite_is_noticed_at_the_next_reset() -> None:
-    env = on_a_gpu(tiny("run", 3))
-    env.reset(seed=0)
+    env = begun(on_a_gpu(tiny("run", 3)))
     action = actions(env, 1)[0]
     action[1, 0, 2, 3] = math.nan
     _, reward, terminated, _, info = env.step(action)
@@ -111,8 +109,7 @@ def test_an_action_that_is_not_finite_is_noticed_at_the_next_reset() -> None:
 
 
 def test_large_actions_are_finite() -> None:
-    env = on_a_gpu(tiny("run", 2))
-    env.reset(seed=0)
+    env = begun(on_a_gpu(tiny("run", 2)))
     env.step(torch.full((2, *env.action_shape), torch.finfo(env.dtype).max, dtype=env.dtype))
     env.reset()
 
@@ -154,12 +151,3 @@ def test_packed_numbers_are_the_same() -> None:
     found = copies.unpack(copies.pack(given).numpy(), given)
     assert_same_bits(found, given)
     assert all(array.flags.writeable and array.flags.aligned for array in found.values())
-
-
-def test_constants_are_shared() -> None:
-    like = torch.zeros(1, dtype=torch.float64)
-    point = copies.constant((0.1, 0.2), like)
-    assert point is copies.constant([0.1, 0.2], like) and point.tolist() == [0.1, 0.2]
-    assert copies.constant(np.float32(0.1), torch.zeros(1)).dtype == torch.float32
-    picture = np.eye(3, dtype=bool)
-    assert copies.constant(picture, like).sum() == 3 and copies.constant(picture, like > 0).dtype == torch.bool

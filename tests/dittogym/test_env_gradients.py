@@ -10,7 +10,7 @@ from functools import cache
 
 import pytest
 import torch
-from tiny import actions, set_particles, tiny
+from tiny import actions, begun, normal, set_particles, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, make_spec
@@ -24,10 +24,6 @@ MATTER = ("mu", "lam", "yield_stress", "mass")
 INPUTS = ("action", "x", "v", "C", "F", *MATTER, "max_actuation", "gravity")
 LOSSES = ("state", "observation", "soft reward", "reward")
 Leaves = dict[str, Tensor]
-
-
-def normal(*shape: int, seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def exact(task: str) -> TaskSpec:
@@ -47,14 +43,12 @@ def environment(task: str, backend: str, segment: int | None = None) -> TorchEnv
 
 
 @cache
-def inputs(task: str, per_particle: bool) -> Leaves:
+def inputs(task: str) -> Leaves:
     """Everything that a loss may be differentiated in."""
-    env = environment(task, "eager")
-    env.reset(seed=3)
+    env = begun(environment(task, "eager"), seed=3)
     n, spec = env.num_particles, make_spec(task)
     own = {name: getattr(spec, name) for name in MATTER if name != "mass"} | {"mass": 1.0}
-    shape = (B, n) if per_particle else (B,)
-    matter = {name: own[name] * (1.0 + 0.1 * normal(*shape, seed=k).abs()) for k, name in enumerate(MATTER)}
+    matter = {name: own[name] * (1.0 + 0.1 * normal(B, seed=k).abs()) for k, name in enumerate(MATTER)}
     strain = 0.08 * normal(B, n, 2, 2, seed=10)
     strain[:, env.model.num_robot_particles :] *= 0.2
     return {
@@ -85,9 +79,9 @@ def losses(env: TorchEnv, given: Leaves) -> tuple[Tensor, ...]:
     return total, 0.01 * (normal(*image.shape, seed=30) * image).sum(), (share * soft).sum(), (share * true).sum()
 
 
-def gradients(task: str, per_particle: bool, backend: str, segment: int | None = None) -> dict[str, Leaves]:
+def gradients(task: str, backend: str, segment: int | None = None) -> dict[str, Leaves]:
     """By loss and input; zero where a loss does not depend on an input."""
-    leaves = {name: value.clone().requires_grad_() for name, value in inputs(task, per_particle).items()}
+    leaves = {name: value.clone().requires_grad_() for name, value in inputs(task).items()}
     found = {}
     for name, loss in zip(LOSSES, losses(environment(task, backend, segment), leaves), strict=True):
         if not loss.requires_grad:  # SHAPE MATCH's true reward counts pixels
@@ -99,13 +93,15 @@ def gradients(task: str, per_particle: bool, backend: str, segment: int | None =
 
 
 @cache
-def plain(task: str, per_particle: bool = False) -> dict[str, Leaves]:
-    return gradients(task, per_particle, "eager")
+def plain(task: str) -> dict[str, Leaves]:
+    return gradients(task, "eager")
 
 
-def check_against_differences(task: str, name: str, per_particle: bool) -> None:
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", INPUTS)
+def test_against_central_differences(task: str, name: str) -> None:
     """In one random direction, all losses at once."""
-    given, direction = inputs(task, per_particle), normal(*inputs(task, per_particle)[name].shape, seed=40)
+    given, direction = inputs(task), normal(*inputs(task)[name].shape, seed=40)
     # Along positions and deformations a step must be short to cross no yield surface and no cell.
     # Along gravity it may be long, and must be where SHAPE MATCH's free robot hardly feels it.
     step = {"x": 1e-8, "F": 1e-8, "gravity": 1e-4}.get(name, 1e-6) * given[name].abs().max().item()
@@ -113,23 +109,11 @@ def check_against_differences(task: str, name: str, per_particle: bool) -> None:
     with torch.no_grad():
         ahead, behind = (losses(env, given | {name: given[name] + side * step * direction}) for side in (1, -1))
     for k, loss in enumerate(LOSSES):
-        slope = (plain(task, per_particle)[loss][name] * direction).sum().item()
+        slope = (plain(task)[loss][name] * direction).sum().item()
         difference = (ahead[k] - behind[k]).item() / (2 * step)
         # What rounding leaves of a difference of two losses.
         floor = 4e-16 * max(abs(ahead[k].item()), 1.0) / step
         assert abs(slope - difference) <= 1e-5 * abs(difference) + 10 * floor, f"{loss}: {slope} {difference}"
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", INPUTS)
-def test_against_central_differences(task: str, name: str) -> None:
-    check_against_differences(task, name, False)
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", MATTER)
-def test_of_values_per_particle(task: str, name: str) -> None:
-    check_against_differences(task, name, True)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -151,14 +135,13 @@ def assert_near(found: dict[str, Leaves], expected: dict[str, Leaves], tolerance
 
 @pytest.mark.parametrize("task", TASKS)
 def test_checkpoints_make_no_difference(task: str) -> None:
-    found = gradients(task, False, "eager", segment=4)
+    found = gradients(task, "eager", segment=4)
     for tolerance, names in ((1e-12, set(INPUTS) - {"mass"}), (1e-11, {"mass"})):  # a sum by segments, over all of them
         expected = {loss: {n: v for n, v in leaves.items() if n in names} for loss, leaves in plain(task).items()}
         assert_near(found, expected, tolerance)
 
 
 @pytest.mark.skipif(not find_compiler(), reason="no C++ compiler")
-@pytest.mark.parametrize("per_particle", [False, True])
 @pytest.mark.parametrize("task", TASKS)
-def test_native_adjoint(task: str, per_particle: bool) -> None:
-    assert_near(gradients(task, per_particle, "native"), plain(task, per_particle), 1e-9)
+def test_native_adjoint(task: str) -> None:
+    assert_near(gradients(task, "native"), plain(task), 1e-9)

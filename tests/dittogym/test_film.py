@@ -268,10 +268,18 @@ def test_a_replay_holds_the_episode(recording: Recording, monkeypatch) -> None:
     assert "http" not in recording.page().replace("http-equiv", "")  # nothing comes from elsewhere
 
 
-def test_a_replay_plays_in_a_browser(recording: Recording, browser: Any, tmp_path) -> None:
-    """The page unpacks its data, plays, draws what a film shows, and in all colours, and says what it holds."""
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """An empty page, on which no error occurs."""
     page, errors = browser.new_page(viewport={"width": 600, "height": 800}), []
     page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page
+    page.close()
+    assert not errors
+
+
+def test_a_replay_plays_in_a_browser(recording: Recording, page: Any, tmp_path) -> None:
+    """The page unpacks its data, plays, draws what a film shows, and in all colours, and says what it holds."""
     page.goto(recording.save(tmp_path / "replay.html").as_uri())
     page.wait_for_function("document.body.dataset.ready && Number(document.getElementById('time').value) > 0.01")
     page.click("#play")
@@ -293,11 +301,9 @@ def test_a_replay_plays_in_a_browser(recording: Recording, browser: Any, tmp_pat
     page.focus("#time")
     page.keyboard.press("ArrowRight")  # one step, of the slider, too
     assert page.evaluate("time.valueAsNumber") == pytest.approx(before + 0.01)
-    page.close()
-    assert not errors
 
 
-def test_a_replay_shows_what_has_gone_wrong(recording: Recording, browser: Any, tmp_path) -> None:
+def test_a_replay_shows_what_has_gone_wrong(recording: Recording, page: Any, tmp_path) -> None:
     """A robot that has flown away, and rewards that are not numbers; also long names, and steps of part of a ms."""
     far = recording.shots[1]._replace(
         x=recording.shots[1].x * np.float32(1e30), centre=np.full(2, 1e27), view=np.zeros(2)
@@ -308,24 +314,18 @@ def test_a_replay_shows_what_has_gone_wrong(recording: Recording, browser: Any, 
         shots=[recording.shots[0], far._replace(origin=np.full(2, 1e27))],
         rewards=[np.nan],
     )
-    page, errors = browser.new_page(viewport={"width": 600, "height": 800}), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(wrong.save(tmp_path / "replay.html", speed=1.0).as_uri())
     page.wait_for_function("document.getElementById('play').textContent === 'Play' && document.body.dataset.ready")
     assert page.inner_text("#return") == "return NaN" and page.inner_text("#about").startswith("1 step of 0.3 ms")
     page.set_viewport_size({"width": 320, "height": 600})
     assert page.evaluate("document.documentElement.scrollWidth") == 320
-    page.close()
-    assert not errors
 
 
-def test_a_return_that_is_rounded_to_zero_has_no_sign(recording: Recording, browser: Any, tmp_path) -> None:
+def test_a_return_that_is_rounded_to_zero_has_no_sign(recording: Recording, page: Any, tmp_path) -> None:
     shots, small = recording.shots[:2], (-0.01, 0.01)
     films = [replace(recording, shots=shots, rewards=[reward]) for reward in small]
     saved = [film.save(tmp_path / "film.gif", size=256, rate=2).read_bytes() for film in films]
     assert saved[0] == saved[1]
-    page = browser.new_page()
     page.goto(films[0].save(tmp_path / "replay.html", speed=1.0).as_uri())
     page.wait_for_function("document.getElementById('play').textContent === 'Play' && document.body.dataset.ready")
     assert page.inner_text("#return") == "return 0.0"
-    page.close()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import TASKS
+from tiny import TASKS, begun
 
 import dittogym
 
@@ -31,8 +31,7 @@ THROW = (1.0, -2.0)
 @torch.no_grad()
 def rollout(task: str) -> list[dict[str, Any]]:
     """Centres, spread, reward terms and channel sums of the observation after each step under a moving wave."""
-    env = dittogym.TorchEnv(task, 1, **OPTIONS)
-    env.reset(seed=0)
+    env = begun(dittogym.TorchEnv(task, 1, **OPTIONS))
     env.state.v[:, : env.model.num_robot_particles] = torch.tensor(THROW, dtype=env.dtype)
     c, r, s = np.indices(env.action_shape)
     rows = []

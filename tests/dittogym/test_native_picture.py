@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import TASKS, actions, on_edge, set_particles, tiny
+from tiny import TASKS, actions, begun, on_edge, set_particles, tiny
 
 import dittogym
 from dittogym import core
@@ -76,8 +76,7 @@ def test_centre_that_is_not_a_number() -> None:
 
 
 def test_threads_share_a_batch() -> None:
-    env = tiny("catch", 5)
-    env.reset(seed=0)
+    env = begun(tiny("catch", 5))
     threads, images = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):

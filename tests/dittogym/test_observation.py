@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from dittogym import observation as obs
-from dittogym.geometry import Box
 from dittogym.observation import encode
 
 
@@ -94,14 +93,3 @@ def test_crop_stays_in_the_window() -> None:
     row, column = obs.crop_corner(centre)
     assert row[:, 0].tolist() == [359, 512, 0, 482]
     assert column[:, 0].tolist() == [256, 0, 512, 153]
-
-
-def test_background_pixels_of_a_box() -> None:
-    """The right beam of GROW: published as fine rows and columns of the whole raster."""
-    origin = torch.tensor([[-0.5, 0.0]], dtype=torch.float64)
-    row, column = torch.tensor([[512]]), torch.tensor([[512]])
-    mask = obs.draw_boxes([Box(15 / 128, 31 / 128, 38 / 128, 41 / 128)], origin, row, column).mask[0]
-    rows, columns = mask.nonzero().unbind(1)
-    assert (columns.min() + 512, columns.max() + 512) == (633, 759)
-    above_ground = 1024 - (rows + 512)
-    assert (above_ground.min(), above_ground.max()) == (305, 327)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from tiny import TASKS, actions, on_edge, tiny
+from tiny import ALL, TASKS, actions, begun, on_edge, tiny
 
 import dittogym
 from dittogym.conditions import act, seen
@@ -29,8 +29,7 @@ def without_waiting() -> Iterator[None]:
 
 
 def on_cuda(task: str, **options: object) -> dittogym.TorchEnv:
-    env = tiny(task, 3, particles=600, dtype="float32", device="cuda", **options)
-    env.reset(seed=0)
+    env = begun(tiny(task, 3, particles=600, dtype="float32", device="cuda", **options))
     return env
 
 
@@ -51,24 +50,10 @@ def test_a_recorded_step_is_the_same(task: str) -> None:
     assert ours._replayed is not None and ours._replayed.failure is None
 
 
-#: Every kind of condition.
-CONDITIONS = {
-    "latency": (0, 2),
-    "action_noise": 0.1,
-    "action_dropout": 0.2,
-    "observation_dropout": 0.2,
-    "mu": (0.8, 1.2),
-    "turn": 5.0,
-    "velocity": 0.1,
-    "grid": 4,
-}
-
-
 def test_conditions_are_those_of_the_cpu() -> None:
     """Draws agree, and images lose the same entries; the recorded step is the same."""
-    ours = on_cuda("run", conditions=CONDITIONS)
-    cpu = tiny("run", 3, particles=600, dtype="float32", conditions=CONDITIONS)
-    cpu.reset(seed=0)
+    ours = on_cuda("run", conditions=ALL)
+    cpu = begun(tiny("run", 3, particles=600, dtype="float32", conditions=ALL))
     for name, value in cpu.env_state.conditions.items():
         assert (ours.env_state.conditions[name].cpu() - value).abs().max() <= 1e-6
     state, image = cpu.env_state.conditions, torch.ones(3, 3, 64, 64)
@@ -85,7 +70,7 @@ def test_conditions_are_those_of_the_cpu() -> None:
 
 @torch.no_grad()
 def test_a_disturbed_step_is_recorded_and_waits_for_nothing() -> None:
-    ours, theirs = (on_cuda("run", conditions=CONDITIONS) for _ in range(2))
+    ours, theirs = (on_cuda("run", conditions=ALL) for _ in range(2))
     theirs._replayed = None
     for given in actions(ours, WARM_UP + 4).to("cuda"):
         assert equal(ours.step(given), theirs.step(given)) and equal(ours.env_state, theirs.env_state)
@@ -126,8 +111,7 @@ def test_another_stream() -> None:
 @pytest.mark.parametrize("particles", ["lite", "full"])
 @torch.no_grad()
 def test_the_kernel_draws_what_torch_does(task: str, particles: str) -> None:
-    env = dittogym.TorchEnv(task, 2, particles=particles, device="cuda")
-    env.reset(seed=0)
+    env = begun(dittogym.TorchEnv(task, 2, particles=particles, device="cuda"))
     env.step(torch.ones(2, *env.action_shape, device="cuda"))
     state, camera = env.env_state, env.model.camera
     arrays = state.particles.x, state.particles.v, state.origin, state.centre

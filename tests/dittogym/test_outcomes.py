@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import TASKS, tiny
+from tiny import TASKS, begun, tiny
 
 import dittogym
 from dittogym import core
@@ -34,8 +34,7 @@ def judge(
         spread: Spread of the robot, m.
         task_state: Entries of the task's state.
     """
-    env = tiny(task, 1)
-    env.reset(seed=0)
+    env = begun(tiny(task, 1))
     state, count = env.env_state, env.model.num_robot_particles
     x, v, origin = state.particles.x.clone(), state.particles.v.clone(), state.origin.clone()
     x[:, :count] += torch.tensor(robot)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from tiny import SMALL, actions, assert_same_bits, everything, make_vec, tiny
+from tiny import SMALL, actions, assert_same_bits, begun, everything, make_vec, tiny
 
 import dittogym
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
@@ -82,8 +82,7 @@ def test_its_own_reward_term_ending_and_success() -> None:
 
 def test_a_specification_needs_no_registration() -> None:
     check_env(dittogym.Env(hop(), particles=50, substeps=1), skip_render_check=True)
-    batch = dittogym.BatchEnv(hop(), 3, autoreset_mode="SameStep", **SMALL)
-    batch.reset(seed=0)
+    batch = begun(dittogym.BatchEnv(hop(), 3, autoreset_mode="SameStep", **SMALL))
     batch.state.x[1, :, 1] += 0.35
     *_, terminated, _, info = batch.step(np.zeros((3, 2, 4, 4), np.float32))
     assert terminated.tolist() == [False, True, False] and info["final_info"]["is_success"][1]
@@ -183,8 +182,7 @@ def test_state_of_a_task_and_objects() -> None:
     stone = BodySpec(Rectangle((0.7, 0.16), (0.06, 0.06)), count=500, mass=4.0)
     functions = {"initial_task_state": initial_peak, "reward_fn": peak_reward}
     spec = changed(objects=(stone,), weights={"peak": 7.0}, gravity=(0.0, 0.0), **functions)
-    env = tiny(spec, 2, particles=(100, 30))
-    env.reset(seed=0)
+    env = begun(tiny(spec, 2, particles=(100, 30)))
     start = env.state.x[:, :100, 1].mean(1)
     still = torch.zeros(2, *env.action_shape, dtype=env.dtype)
     env.state.x[:, :100, 1] += torch.tensor([[0.1], [0.2]])
@@ -210,8 +208,7 @@ def test_a_reset_that_fails_changes_nothing() -> None:
     def remembered(transition: Transition, spec: TaskSpec) -> dict[str, torch.Tensor]:
         return {"start": transition.now.com} if working else {}["missing"]
 
-    env, untouched = (tiny(changed(initial_task_state=remembered), 2, resample=True) for _ in range(2))
-    env.reset(seed=0), untouched.reset(seed=0)
+    env, untouched = (begun(tiny(changed(initial_task_state=remembered), 2, resample=True)) for _ in range(2))
     before, working = everything(env), False
     for options in ({"physics": {"mu": 100.0}}, {"positions": env.state.x + 0.01}, {"reset_mask": [True, False]}):
         with pytest.raises(KeyError):
@@ -226,8 +223,7 @@ def test_a_term_in_double_precision_leaves_that_of_the_reward() -> None:
     def precise(transition: Transition, spec: TaskSpec) -> Reward:
         return Reward({"height": transition.now.com[:, 1].double()})
 
-    env = tiny(changed(reward_fn=precise), dtype="float32")
-    env.reset(seed=0)
+    env = begun(tiny(changed(reward_fn=precise), dtype="float32"))
     _, reward, _, _, info = env.step(actions(env, 1)[0])
     assert reward.dtype == info["reward_terms"]["height"].dtype == torch.float32
 
@@ -291,6 +287,5 @@ def test_a_batch_is_made_again_from_the_json_of_its_specification() -> None:
 def test_centres_may_be_lists_and_a_fixed_window_may_lie_anywhere() -> None:
     spec = changed(view=[None, 0.28], window=Window(left=0.1))
     assert spec.view == (None, 0.28)
-    env = tiny(spec)
-    env.reset(seed=0)
+    env = begun(tiny(spec))
     assert env.env_state.origin.tolist() == [[0.1, 0.0]]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import recordings
-import reference
 import torch
 
 import dittogym
@@ -39,18 +38,3 @@ def test_the_extract_is_of_the_complete_recordings(name: str) -> None:
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         np.testing.assert_array_equal(found[key], value, err_msg=key)
-
-
-def test_a_reset_leaves_what_the_reference_leaves() -> None:
-    """The last image, the centre of the first action, and what CATCH's hand is chosen by; particles stay unit ones."""
-    env = reference.make("catch", particles=(120, 30), substeps=4, dtype="float64")
-    first, _ = env.reset(seed=0)
-    for _ in range(3):
-        last, *_ = env.step(np.ones(env.action_space.shape, np.float32))
-    before = env.torch_env.env_state
-    again, _ = env.reset()
-    after, (robot, cube) = env.torch_env.env_state, env.torch_env.model.solver.bodies
-    assert np.array_equal(again, last) and not np.array_equal(again, first)
-    assert torch.equal(after.centre, before.centre) and not torch.equal(after.centre, after.start.com)
-    assert torch.equal(after.task_state["object_com"], before.task_state["object_com"])
-    assert (robot.volume, cube.volume, robot.mass, env.state.x.shape) == (1.0, 1.0, 2.0, (1, 150, 2))

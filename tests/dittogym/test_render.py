@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny import begun
 
 from dittogym import BatchEnv, Env, TorchEnv, make_spec
 from dittogym.render.frame import BRIDGE, GROUND, SOLID, TARGET, TILE, Canvas, frame
@@ -17,8 +18,7 @@ def near(image: np.ndarray, colour) -> np.ndarray:
 
 @pytest.mark.parametrize("particles", ["full", "lite"])
 def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
-    env = TorchEnv("run", 1, particles=particles)
-    env.reset(seed=0)
+    env = begun(TorchEnv("run", 1, particles=particles))
     image = env.render(zoom=1)
     assert image.shape == (512, 512, 3) and image.dtype == np.uint8
     rows, columns = near(image, ROBOT)
@@ -31,8 +31,7 @@ def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
 
 
 def test_muscles_target_and_size() -> None:
-    env = TorchEnv("shapematch", 2, particles=500, substeps=1)
-    env.reset(seed=0)
+    env = begun(TorchEnv("shapematch", 2, particles=500, substeps=1))
     plain = env.render(1, size=128)
     assert plain.shape == (128, 128, 3)
     assert np.array_equal(plain, env.render(1, muscles=True, size=128))  # nothing acts yet
@@ -45,8 +44,7 @@ def test_muscles_target_and_size() -> None:
 
 
 def test_a_shot_holds_the_quantities_that_are_asked_for() -> None:
-    env = TorchEnv("kick", 1, particles=100, substeps=1)
-    env.reset(seed=0)
+    env = begun(TorchEnv("kick", 1, particles=100, substeps=1))
     assert set(env.shot().values) == {"deformation", "speed"}  # nothing acts yet
     env.step(torch.ones(1, *env.action_shape))
     whole = env.shot()
@@ -58,8 +56,7 @@ def test_a_shot_holds_the_quantities_that_are_asked_for() -> None:
 
 def test_scales() -> None:
     """The quantities in their units, and colours at the ends of a scale, beyond them, and without a value."""
-    env = TorchEnv("kick", 1, particles=100, dtype="float64")
-    env.reset(seed=0)
+    env = begun(TorchEnv("kick", 1, particles=100, dtype="float64"))
     stretch = 1.03
     env.state.F[0, 0] = torch.tensor([[0.0, -stretch], [1 / stretch, 0.0]])  # stretched along y, and turned
     env.state.v[0, -1] = torch.tensor([0.3, -0.4])
@@ -73,8 +70,7 @@ def test_scales() -> None:
 
 @pytest.mark.parametrize("task", ["shapematch", "slot"])
 def test_a_robot_that_has_flown_far_away(task: str) -> None:
-    env = TorchEnv(task, 1, particles=100, substeps=1)
-    env.reset(seed=0)
+    env = begun(TorchEnv(task, 1, particles=100, substeps=1))
     env.state.v.fill_(1e30)
     with torch.no_grad():
         assert not env.step(torch.zeros(1, *env.action_shape))[-1]["finite"]
@@ -121,8 +117,7 @@ def test_the_floor_moves_past_a_camera_that_follows() -> None:
 
 @pytest.mark.parametrize(("task", "colours"), [("run", ()), ("grow", (TARGET,)), ("kick", (OBJECT,))])
 def test_a_legend_shows_the_colours_of_the_scene(task: str, colours) -> None:
-    env = TorchEnv(task, 1, particles=100)
-    env.reset(seed=0)
+    env = begun(TorchEnv(task, 1, particles=100))
     scene, shot = describe(env.model), env.shot()
     top = frame(scene, shot, 360, legend=True)[17:34]
     others = {TARGET, OBJECT} - set(colours)

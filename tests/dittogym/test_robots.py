@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny import TASKS, tiny
+from tiny import TASKS, begun, tiny
 
 import dittogym
 from dittogym.bodies.images import read_mask
@@ -88,8 +88,7 @@ def test_area_and_place_are_those_of_the_tasks_own_robot(task: str, body) -> Non
 @pytest.mark.parametrize("particles", [2000, "full"])
 def test_particles_fill_the_mask_evenly(body, particles) -> None:
     """Sobol and random draws: every cell of the L holds its share, what is outside holds none; the foot is below."""
-    env = tiny("run", body=body, particles=particles)
-    env.reset(seed=0)
+    env = begun(tiny("run", body=body, particles=particles))
     shape, x = env.spec.robot.shape, env.state.x[0].numpy()
     column, above = ((x - shape.corner) / shape.size * 6).clip(0, 6 - 1e-9).astype(int).T
     cells = np.zeros((6, 6), int)
@@ -106,8 +105,7 @@ def test_a_shape_lies_where_it_says_and_is_as_dense() -> None:
     assert spec.robot.mass == own.mass
     body = BodySpec(Disc((0.1, 0.2), 0.1), count=77, mass=3.5)  # is taken as it is
     assert dittogym.make_spec("kick", body=body).robot is body
-    env = dittogym.TorchEnv(spec, particles="lite")
-    env.reset(seed=0)
+    env = begun(dittogym.TorchEnv(spec, particles="lite"))
     assert env.state.x[0].mean(0).tolist() == pytest.approx([0.1, 0.36], abs=1e-3)
     assert env.env_state.origin[0].tolist() == pytest.approx([0.1 - 0.4, 0.0], abs=1e-3)
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tiny import TASKS, actions, stir, tiny
+from tiny import TASKS, actions, begun, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
@@ -17,8 +17,7 @@ from dittogym.rewards import features_of
 
 def stirred(task: str, **options: object) -> TorchEnv:
     """Two simulations in motion, a step after the start."""
-    env = tiny(task, 2, **options)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2, **options))
     stir(env)
     with torch.no_grad():
         env.step(actions(env, 1)[0])
@@ -78,8 +77,7 @@ def test_is_the_image_at_the_lite_tier(task: str) -> None:
 @torch.no_grad()
 def test_silhouette_at_full_size(task: str) -> None:
     """Nearer to the reference's raster of a random layout than that of another layout is."""
-    env = TorchEnv(task, 2)
-    env.reset(seed=0)
+    env = begun(TorchEnv(task, 2))
     image = env.save().observation
     on, soft = silhouette(image), soft_silhouette(env.soft_observation())
     wrong = (on ^ (soft > 0.5)).sum((1, 2))

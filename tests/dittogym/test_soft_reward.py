@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
+from tiny import TASKS, actions, assert_same_bits, begun, everything, normal, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv, core
@@ -17,10 +17,6 @@ from dittogym.tasks.slot import FALLEN, FAR_SIDE
 
 #: Tasks whose reward looks at velocities.
 WITH_SPEED = ("run", "kick", "dig", "obstacle", "slot")
-
-
-def normal(*shape: int, seed: int = 1) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def reward(env: TorchEnv, state: EnvState, soft: bool = False) -> Tensor:
@@ -37,8 +33,7 @@ def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
 
 def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     """A task with the first simulation where its reward jumps or bends, and random velocities."""
-    env = tiny(task, 2)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2))
     stir(env)
     x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
@@ -60,7 +55,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
 def test_gradient_at_thresholds_against_central_differences(task: str, name: str) -> None:
     env, *given = at_threshold(task)
     which = ("x", "v").index(name)
-    leaf, direction = given[which].requires_grad_(), normal(*given[which].shape) + 1.0
+    leaf, direction = given[which].requires_grad_(), normal(*given[which].shape, seed=1) + 1.0
 
     def total(value: Tensor) -> Tensor:
         values = [value if i == which else t for i, t in enumerate(given)]
@@ -109,8 +104,7 @@ def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
 @torch.no_grad()
 def test_gap_from_rest(task: str) -> None:
     """Away from thresholds the soft reward is the true one; SHAPE MATCH counts pixels, and CATCH and SLOT particles."""
-    env = tiny(task, 2, particles=2000)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2, particles=2000))
     gap = (reward(env, env.env_state, soft=True) - reward(env, env.env_state)).abs().max()
     bounds = {"shapematch": 2.5, "catch": 0.15, "slot": 0.6}
     assert gap <= bounds.get(task, 0.01)
@@ -119,8 +113,7 @@ def test_gap_from_rest(task: str) -> None:
 @pytest.mark.parametrize("task", ["shapematch", "slot", "run"])
 def test_step_with_soft_rewards(task: str) -> None:
     """The same simulation, judged twice; the gradient reaches back through several steps."""
-    env, plain = tiny(task, 2, resolution=8), tiny(task, 2, resolution=8)
-    env.reset(seed=0), plain.reset(seed=0)
+    env, plain = begun(tiny(task, 2, resolution=8)), begun(tiny(task, 2, resolution=8))
     drive = (0.5 * actions(env, 2)).requires_grad_()
     total = torch.zeros(2, dtype=env.dtype)
     for action in drive:
@@ -175,7 +168,7 @@ def test_soft_choice_of_the_nearest() -> None:
 
 
 def test_distances_of_particles_and_of_averages() -> None:
-    x, point = normal(3, 5, 2), normal(3, 2, seed=2)
+    x, point = normal(3, 5, 2, seed=1), normal(3, 2, seed=2)
     expected = (x - point[:, None]).norm(dim=-1)
     torch.testing.assert_close(distance(x, point), expected)
     torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])

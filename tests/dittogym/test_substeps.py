@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import TASKS, tiny
+from tiny import TASKS, begun, tiny
 
 import dittogym
 
@@ -37,8 +37,7 @@ def test_damping_takes_the_same_share_of_the_velocity_in_the_same_time() -> None
     spec = replace(dittogym.make_spec("run"), gravity=(0.0, 0.0))
     assert spec.damping < 1.0
     for dt in (5e-5, 1e-4, 2e-4):
-        env = tiny(spec, dt=dt, substeps=None)
-        env.reset(seed=0)
+        env = begun(tiny(spec, dt=dt, substeps=None))
         env.state.v[..., 1] = 1.0  # away from the floor
         env.step(torch.zeros(1, *env.action_shape))
         assert float(env.state.v[..., 1].mean()) == pytest.approx(spec.damping**100, rel=1e-9)
@@ -47,8 +46,7 @@ def test_damping_takes_the_same_share_of_the_velocity_in_the_same_time() -> None
 def test_longer_substeps_end_near_the_same_place() -> None:
     ends = []
     for dt in (1e-4, 2e-4):
-        env = tiny("kick", dt=dt, substeps=None)
-        env.reset(seed=0)
+        env = begun(tiny("kick", dt=dt, substeps=None))
         start = env.state.x
         for _ in range(5):
             env.step(0.5 * torch.ones(1, *env.action_shape))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from tiny import ALL, TASKS, actions, set_particles, tiny
+from tiny import ALL, TASKS, actions, begun, set_particles, tiny
 from torch import Tensor
 
 from dittogym import core
@@ -16,8 +16,7 @@ from torchmpm import tree
 
 def reward_of(task: str) -> tuple[Callable[[Tensor], Tensor], Tensor]:
     """Smooth reward of the first step of an episode as a function of its actions, and such actions (3, B, 2, R, R)."""
-    env = tiny(task, 2, backend="eager", substeps=2)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2, backend="eager", substeps=2))
     start = env.state.x.clone()
 
     def reward(action: Tensor) -> Tensor:
@@ -42,8 +41,7 @@ def test_transforms_of_the_pure_step_give_what_autograd_gives(task: str) -> None
 @pytest.mark.parametrize("task", TASKS)
 def test_vmap_maps_over_states(task: str) -> None:
     """In tasks with and without an object."""
-    env = tiny(task, 2, backend="eager", substeps=2)
-    env.reset(seed=0)
+    env = begun(tiny(task, 2, backend="eager", substeps=2))
     alone = [tree.map(lambda tensor, i=i: tensor[i : i + 1], env.env_state) for i in range(2)]
     drive = actions(env, 1)[0][:, None]
     states = tree.map(lambda *tensors: torch.stack(tensors), *alone)
@@ -85,8 +83,7 @@ def test_gradients_from_a_state_that_was_made_in_inference_mode(task: str, backe
 
 
 def test_a_graph_is_neither_pickled_nor_copied_without_a_word() -> None:
-    env = tiny("run", 1)
-    env.reset(seed=0)
+    env = begun(tiny("run", 1))
     env.step(torch.zeros(1, 2, 8, 8, requires_grad=True))
     for copied in (copy.deepcopy, pickle.dumps):
         for thing, name in ((env, "TorchEnv"), (env.save(), "TorchEnv"), (env.state, "ParticleState")):
@@ -97,8 +94,7 @@ def test_a_graph_is_neither_pickled_nor_copied_without_a_word() -> None:
 
 
 def test_the_reward_has_second_derivatives_at_rest() -> None:
-    env = tiny("run", backend="eager", particles=50, substeps=2)
-    env.reset(seed=0)
+    env = begun(tiny("run", backend="eager", particles=50, substeps=2))
     action = torch.zeros(1, *env.action_shape, dtype=env.dtype, requires_grad=True)
     (first,) = torch.autograd.grad(env.step(action)[1].sum(), action, create_graph=True)
     assert torch.autograd.grad(first.sum(), action)[0].isfinite().all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import wrappers
-from tiny import SMALL, make_vec
+from tiny import SMALL, begun, make_vec
 from torch.nn.functional import interpolate
 
 from dittogym.wrappers import action_resolution, observation_resolution
@@ -88,47 +88,15 @@ def test_observations_are_area_means(size: int) -> None:
 # Gymnasium's wrappers.
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_record_episode_statistics_of_a_batch(mode: str) -> None:
-    env = wrappers.vector.RecordEpisodeStatistics(batch(max_episode_steps=3, autoreset_mode=mode))
-    env.reset(seed=0)
-    rewards = []
-    for _ in range(3):
-        _, reward, _, truncated, info = env.step(np.ones(env.action_space.shape, np.float32))
-        rewards.append(reward)
-    assert truncated.all() and info["_episode"].all()
-    assert info["episode"]["l"].tolist() == [3, 3]
-    assert info["episode"]["r"] == pytest.approx(np.sum(rewards, axis=0), abs=1e-4)
-
-
 def test_truth_values_are_those_of_python() -> None:
     """Gymnasium's vector environments would keep NumPy's as objects; its conversions to other arrays refuse them."""
     env = gymnasium.make("dittogym/catch-coarse-v0", **SMALL)
     for info in (env.reset(seed=0)[1], env.step(env.action_space.sample())[4]):
         assert {name for name, value in info.items() if isinstance(value, bool)} == {"finite", "is_success"} & {*info}
         assert not any(isinstance(value, np.bool_) for value in info.values())
-    several = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("dittogym/catch-coarse-v0", **SMALL)] * 2)
-    several.reset(seed=0)
+    several = begun(gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("dittogym/catch-coarse-v0", **SMALL)] * 2))
     info = several.step(several.action_space.sample())[4]
     assert info["finite"].dtype == info["is_success"].dtype == bool
-
-
-def test_conversion_to_torch() -> None:
-    pytest.importorskip("array_api_compat")
-    env = wrappers.NumpyToTorch(gymnasium.make("dittogym/catch-coarse-v0", **SMALL))
-    info = env.reset(seed=0)[1]
-    assert info["finite"].dtype == torch.bool
-
-
-def test_gymnasiums_own_vector_environments() -> None:
-    env = gymnasium.make_vec(NAME, num_envs=2, vectorization_mode="sync", **SMALL)
-    ours = batch()
-    assert np.array_equal(env.reset(seed=4)[0], ours.reset(seed=4)[0])
-    action = np.ones(env.action_space.shape, np.float32)
-    theirs, results = env.step(action), ours.step(action)
-    assert np.array_equal(theirs[0], results[0]) and theirs[1] == pytest.approx(results[1], abs=1e-5)
-    assert theirs[4]["com"] == pytest.approx(results[4]["com"], abs=1e-6)
-    assert set(results[4]) == set(theirs[4])
 
 
 @pytest.fixture
@@ -140,8 +108,7 @@ def pygame(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_window_on_the_screen_shows_the_picture(pygame) -> None:
-    env = single(render_mode="human")
-    env.reset(seed=0)
+    env = begun(single(render_mode="human"))
     for _ in range(2):
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
         assert np.array_equal(shown[50:], env.unwrapped.torch_env.render()[50:])  # below caption and legend
@@ -165,8 +132,7 @@ def test_the_window_pauses_steps_and_closes(pygame) -> None:
         assert len(waiting) == left
         press(*(event.key for event in waiting))
     for closing in (pygame.event.Event(pygame.KEYDOWN, key=pygame.K_q), pygame.event.Event(pygame.QUIT)):
-        env = single(render_mode="human")
-        env.reset(seed=0)
+        env = begun(single(render_mode="human"))
         pygame.event.post(closing)
         env.step(action)
         assert not env.unwrapped.window_open and not pygame.display.get_init()
@@ -178,8 +144,7 @@ def test_a_real_video(tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # moviepy's
-        env = wrappers.RecordVideo(single(render_mode="rgb_array", max_episode_steps=3), str(tmp_path))
-        env.reset(seed=0)
+        env = begun(wrappers.RecordVideo(single(render_mode="rgb_array", max_episode_steps=3), str(tmp_path)))
         for _ in range(3):
             env.step(np.zeros(env.action_space.shape, np.float32))
         env.close()

@@ -47,6 +47,12 @@ def make_vec(task: str = "run", num_envs: int = 2, **options: Any) -> gymnasium.
     return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
 
 
+def begun(env: Any, seed: int = 0) -> Any:
+    """The environment after a reset."""
+    env.reset(seed=seed)
+    return env
+
+
 def on_edge(env: dittogym.TorchEnv) -> torch.Tensor:
     """Entries of the picture that rounding of the sums may bring to either of two bytes, (B, 3, 64, 64) bool.
 
@@ -59,6 +65,11 @@ def on_edge(env: dittogym.TorchEnv) -> torch.Tensor:
     return (gap > 0) & (gap < 2e-3)  # empty space is exact
 
 
+def normal(*shape: int, seed: int) -> torch.Tensor:
+    """Normally distributed numbers."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
 def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
     """Random actions (steps, B, 2, R, R)."""
     generator = torch.Generator().manual_seed(seed)
@@ -69,8 +80,19 @@ def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
 def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
     """Give element i the random velocities of ``seed + i``, about 1 m/s, so that things happen within few substeps."""
     for i in range(env.num_envs):
-        generator = torch.Generator().manual_seed(seed + i)
-        env.state.v[i] += torch.randn(env.state.v[i].shape, generator=generator, dtype=torch.float64).to(env.dtype)
+        env.state.v[i] += normal(*env.state.v[i].shape, seed=seed + i).to(env.dtype)
+
+
+@torch.no_grad()
+def episode(env: dittogym.TorchEnv, seed: int) -> list[Any]:
+    """All that a batch of two shows and is over a few steps, one of them reset on the way."""
+    rows: list[Any] = [env.reset(seed=seed)]
+    stir(env, seed)
+    for t, action in enumerate(actions(env, 4, seed)):
+        if t == 2:
+            rows.append(env.reset(options={"reset_mask": [True, False]}))
+        rows += [env.step(action), everything(env)]
+    return rows
 
 
 def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:

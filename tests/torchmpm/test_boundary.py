@@ -20,9 +20,8 @@ STICK = math.inf
 
 
 def apply(rules: tuple[VelocityRule, ...], velocity: Tensor, origin: Tensor | None = None) -> Tensor:
-    """Rules on the velocities of nodes that exist, (2, B, R, R)."""
-    batch = velocity.shape[1]
-    origin = torch.zeros(batch, 2, dtype=velocity.dtype) if origin is None else origin
+    """Rules on the velocities of nodes that exist, (2, 1, R, R)."""
+    origin = torch.zeros(1, 2, dtype=velocity.dtype) if origin is None else origin
     padded = torch.nn.functional.pad(velocity, [PAD] * 4).flatten(2)
     result = constrain(faces(rules, GRID, origin), padded).unflatten(-1, (GRID.width, GRID.width))
     inner = result[..., PAD:-PAD, PAD:-PAD]
@@ -30,8 +29,8 @@ def apply(rules: tuple[VelocityRule, ...], velocity: Tensor, origin: Tensor | No
     return inner
 
 
-def everywhere(x: float, y: float, batch: int = 1) -> Tensor:
-    return torch.tensor([x, y], dtype=torch.float64)[:, None, None, None].expand(2, batch, R, R)
+def everywhere(x: float, y: float) -> Tensor:
+    return torch.tensor([x, y], dtype=torch.float64)[:, None, None, None].expand(2, 1, R, R)
 
 
 def after(rule: VelocityRule, x: float, y: float) -> tuple[float, float]:
@@ -66,17 +65,6 @@ def test_windows_at_whole_nodes(resolution: int, dtype: torch.dtype) -> None:
     origin = (nodes.to(torch.float64) * grid.h).to(dtype)[:, None].expand(-1, 2)
     assert torch.equal(grid.node_shift(origin), nodes[:, None].expand(-1, 2))
     assert torch.equal(grid.node_shift(origin + 0.99 * grid.h)[300:], nodes[300:, None].expand(-1, 2))
-
-
-def test_each_simulation_has_its_origin() -> None:
-    origin = torch.tensor([[0.0, 0.0], [2.0, 0.0], [-1.0, 0.0]], dtype=torch.float64) * GRID.h
-    rules = (VelocityRule("-y", i=(3, 4), friction=0.5), VelocityRule("+x", i=(0, 0), friction=STICK))
-    velocity = normal(2, 3, R, R, seed=0)
-    together = apply(rules, velocity, origin)
-    for b in range(3):
-        alone = apply(rules, velocity[:, b : b + 1], origin[b : b + 1])
-        assert torch.equal(together[:, b : b + 1], alone)
-    assert not torch.equal(together[:, 0] == 0, together[:, 1] == 0)
 
 
 def test_fixed_holds_nodes_at_rest() -> None:
@@ -144,12 +132,6 @@ def test_against_rules_in_sequence(listed: tuple[VelocityRule, ...], cells: tupl
     velocity[velocity.abs() < 0.2] = 0.0
     found, expected = apply(listed, velocity, origin), sequential(listed, velocity, origin)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-15)
-
-
-def test_gradient_of_friction() -> None:
-    velocity = normal(2, 1, R, R, seed=3).requires_grad_()
-    listed = (VelocityRule("-y", friction=0.3), VelocityRule("+x", i=(0, 3), friction=0.6))
-    assert torch.autograd.gradcheck(lambda v: apply(listed, v), (velocity,), fast_mode=True)
 
 
 def test_friction_has_second_derivatives_at_rest() -> None:

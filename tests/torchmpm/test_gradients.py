@@ -43,21 +43,21 @@ def inputs(strain: float) -> Leaves:
     }
 
 
-def loss(given: Leaves, rules: tuple[VelocityRule, ...], segment: int | None = None) -> Tensor:
+def loss(given: Leaves, rules: tuple[VelocityRule, ...]) -> Tensor:
     """A random combination of all numbers of the final state."""
     material = VonMises(given["mu"], given["lam"], given["yield_stress"])
     body = Body(N, material, given["mass"], given["volume"], muscle=True)
     solver = robot(N, bodies=(body,), gravity=given["gravity"], rules=rules, damping=0.999)
     start = ParticleState(given["x"], given["v"], given["C"], given["F"], given["x"].new_ones(B, N))
     field, origin = given["actuation"], given["origin"]
-    final = solver.step(start, field, substeps=SUBSTEPS, segment=segment, origin=origin)
+    final = solver.step(start, field, substeps=SUBSTEPS, origin=origin)
     return combination(final, 20, x=1.0, v=0.2, C=0.01, F=1.0)
 
 
-def gradients(scene: str, segment: int | None = None, dtype: torch.dtype = torch.float64) -> Leaves:
+def gradients(scene: str, dtype: torch.dtype = torch.float64) -> Leaves:
     options = SCENES[scene]
     given = {name: value.to(dtype, copy=True).requires_grad_() for name, value in inputs(options["strain"]).items()}
-    found = torch.autograd.grad(loss(given, options["rules"], segment), list(given.values()))
+    found = torch.autograd.grad(loss(given, options["rules"]), list(given.values()))
     return dict(zip(given, found, strict=True))
 
 
@@ -79,13 +79,6 @@ def test_against_central_differences(scene: tuple[str, Leaves], name: str) -> No
     # Where a step may cross a yield surface or a cell it is shorter; elsewhere rounding asks for a longer one.
     step = (1e-6 if name in ("x", "F", "origin") else 1e-5) * given[name].abs().max().item()
     assert_slope(lambda given: loss(given, options["rules"]), given, name, found[name], step)
-
-
-@pytest.mark.parametrize("segment", [3, 10])
-def test_segments_do_not_change_gradients(scene: tuple[str, Leaves], segment: int) -> None:
-    label, plain = scene
-    for name, value in gradients(label, segment).items():
-        torch.testing.assert_close(value, plain[name], rtol=0, atol=1e-12 * max(plain[name].abs().max().item(), 1e-9))
 
 
 def test_default_step_is_differentiable_from_rest() -> None:
