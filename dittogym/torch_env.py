@@ -277,8 +277,9 @@ class TorchEnv:
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
                 Conditions are drawn in either case; those of a seed are always the same.
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
-                ``resample`` until the next reset; ``"physics"``: constants of the matter, see
-                :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
+                ``resample`` until the next reset; particles keep their masses and volumes at rest. ``"physics"``:
+                constants of the matter, see :func:`dittogym.physics.physics_values`, used until given again, ``{}``
+                goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements; in an array, a GPU need not be waited for.
                 Later resets reuse values without gradients.
 

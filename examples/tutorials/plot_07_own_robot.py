@@ -72,7 +72,7 @@ print(f"{100 * travelled:.0f} cm in {recording.duration:.1f} s")
 # To train a policy for this body, make it a :ref:`custom task <sphx_glr_gallery_plot_06_own_task.py>`: a function that
 # returns ``dataclasses.replace(dittogym.make_spec("run", body=PICTURE), name="stool")``. With ``PICTURE =
 # Path(__file__).with_name("stool.png")`` the file is found from every working directory. Targets of SHAPE MATCH can be
-# given in the same forms as bodies (``target=``).
+# pictures and outlines, too (``target=``).
 
 assert torch.isfinite(env.state.x).all()
 assert travelled > 0.1

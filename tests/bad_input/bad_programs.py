@@ -123,6 +123,9 @@ OTHERS = (
         "learn",
         ("--algo alchemy", "algo must be one of cfp-analytic, cfp-sac, coarse", "'alchemy'"),
         ("--algo zero", "algo: 'zero' is a reference policy"),
+        ("--algo nowhere:Own", "algo: nowhere:Own cannot be imported", "No module named 'nowhere'"),
+        ("--algo os:path", "algo must name a subclass of cfp.learner.Learner", "'os:path'"),
+        ("--algo os.path:join", "algo must be one of", "'os.path:join'"),
         ("--algo coarse --learner analytic", "learner must not be given"),
         ("--algo gnn-16 --particles 10", "particles of the robot must be at least 16", "got 10"),
         ("--task kick --algo gnn-64 --particles 63 100", "particles of the robot must be at least 64", "got 63"),
@@ -217,6 +220,7 @@ OTHERS = (
     )
     + rows(
         "rank",
+        ("", "policies must be one or more, got none"),
         ("none", "none: there is no policy"),
         ("none.json", "none.json: cannot be read as JSON"),
         ("zero --tasks swim", "task must be one of"),

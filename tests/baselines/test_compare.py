@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+import baselines
 from baselines.compare import paper, processes, worker
 from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
@@ -22,6 +23,7 @@ from baselines.compare.plan import PlannedRun, make_runs, read_plan, to_words
 from baselines.compare.processes import LocalExecutor, Resources, carry_out
 from baselines.compare.report import align, make_table, read_result, write_report
 from cfp.errors import ConfigError
+from cfp.evaluate import main as evaluate
 from cfp.files import write_json, write_text
 from cfp.tables import read_table
 
@@ -152,6 +154,18 @@ def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, here, t
     assert zero == [row for row in rows(finished) if row["algorithm"] == "zero"] and len(mpc) == 2
     own = json.loads((out / "runs" / "mpc-shapematch-quick-0" / "comparison.json").read_text())["evaluation"]
     assert own["own_layout"] not in own["returns"]  # on the only layout that it is made for
+
+
+def test_an_algorithm_of_ones_own_is_named_by_its_module(here, tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_planner.py").write_text("from baselines.planning.mpc import MPC as Planner\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    plan = {**PLAN, "algos": {"own_planner:Planner": MPC}}
+    out = tmp_path / "own"
+    assert compare(out, "--algos", "own_planner:Planner", "--seeds", "0", plan=plan) == 0
+    run = baselines.Run(out / "runs" / "Planner-shapematch-quick-0")
+    assert run.config.algo == run.policy.description["kind"] == "own_planner:Planner"
+    assert {row["algorithm"] for row in rows(out)} == {"own_planner:Planner"}
+    assert evaluate(["--episodes", "1", str(run.folder)]) == 0 and "replayed" in capsys.readouterr().out
 
 
 def test_failed_run_is_reported_and_stops_no_other(here, tmp_path, capsys):

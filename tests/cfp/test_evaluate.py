@@ -209,5 +209,9 @@ def test_any_policy_is_evaluated_as_those_of_the_package():
         )
     )
     assert image != grid == trained
+    function = cfp.evaluate_policy(lambda images: torch.from_numpy(column), "shapematch", 1, **options)
+    assert function.mean == image
+    with pytest.raises(TypeError, match="policy must be a function or have a method predict, got int"):
+        cfp.evaluate_policy(3, "shapematch", 1, **options)
     policy = cfp.load("shapematch")
     assert cfp.evaluate_policy(policy, "shapematch", 1, particles=100, substeps=1).resolution == policy.resolution

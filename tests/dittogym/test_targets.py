@@ -40,6 +40,7 @@ def test_drawings_are_fitted_to_the_robot(tmp_path) -> None:
     red = np.where(mask[..., None], (40, 40, 220), (250, 250, 250)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "heart.jpg"), red, [cv2.IMWRITE_JPEG_QUALITY, 40])
     drawings = [heart(2000), heart(64), heart(centre=(0.3, 0.25), scale=0.01), np.pad(mask, ((0, 90), (0, 300)))]
+    drawings.append([(0, -17), (14, -3), (16, 3), (12, 11), (5, 12), (0, 5), (-5, 12), (-12, 11), (-16, 3), (-14, -3)])
     for drawing in (tmp_path / "heart.jpg", *drawings):
         union = load_target(drawing) | fitted
         assert (load_target(drawing) & fitted).sum() > 0.9 * union.sum()
