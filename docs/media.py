@@ -1,7 +1,7 @@
 """Films of the policies that come with the package: `python docs/media.py [POLICY ...]`.
 
 Each policy gets `images/films/POLICY.webp`, that of OBSTACLE some moments beside each other in `images/hero.png`, and
-those of all tasks together, of two policies the one that reaches the goal, `images/tasks.webp`. The hash of the policy
+those of all tasks together, one policy for each (`SHOWN`), `images/tasks.webp`. The hash of the policy
 behind each film is kept in `images/films/sources.json`; a test compares them with those of the package.
 """
 
@@ -26,6 +26,8 @@ SHIPPED = Path(cfp.__file__).parent / "pretrained"
 FILMS = IMAGES / "films"
 SOURCES = FILMS / "sources.json"
 POLICIES = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+#: In the film of all tasks, where a task has two: the policy that reaches the goal, or stays in one piece.
+SHOWN = {"grow": "grow-success", "slot": "slot-success", "obstacle": "obstacle-rewards"}
 #: Pixels of a task's own film and of a cell of the grid, and cells in a row.
 SIZE, CELL, COLUMNS = 360, 240, 4
 #: White pixels between pictures beside each other.
@@ -101,8 +103,8 @@ def main() -> None:
         sources[name] = policy_hash(name)
     if HERO in (names or recordings):
         Image.fromarray(moments(recordings[HERO])).save(IMAGES / "hero.png", optimize=True)
-    solved = {task: recordings.get(f"{task}-success", recordings[task]) for task in dittogym.TASKS}
-    write_film(IMAGES / "tasks.webp", grid_frames(solved), RATE)
+    shown = {task: recordings[SHOWN.get(task, task)] for task in dittogym.TASKS}
+    write_film(IMAGES / "tasks.webp", grid_frames(shown), RATE)
     SOURCES.write_text(json.dumps(dict(sorted(sources.items())), indent=2) + "\n")
 
 

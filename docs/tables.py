@@ -78,13 +78,13 @@ def estimate(row: Row) -> str:
     return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
 
 
-#: Tasks whose policy was preferred to others by episodes from its own start that are in the table, which flatters them.
+#: Policies that were preferred to others by episodes from their own start that are in the table, which flatters them.
 CHOSEN_ON_OWN_START = ("dig", "grow", "kick", "obstacle", "shapematch")
 
 
 def compared(row: Row, theirs: int) -> str:
     """The same, bold if the lower end of the interval is above the paper's return, and nothing was chosen by it."""
-    fair = row["interval"] and row["task"] not in CHOSEN_ON_OWN_START
+    fair = row["interval"] and row["policy"] not in CHOSEN_ON_OWN_START
     return f"**{estimate(row)}**" if fair and float(row["mean"]) - float(row["interval"]) > theirs else estimate(row)
 
 

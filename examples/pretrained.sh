@@ -7,6 +7,10 @@ set -e
 torchmpm train --task run --algo cfp-sac --preset long --resolutions 4 --steps 160000 --seed 1 \
     --critics-first 0.0027466 --out runs/run-rewards
 
+# obstacle-rewards: the policy of step 150,000
+torchmpm train --task obstacle --algo cfp-sac --preset long --resolutions 4 --steps 160000 --critics-first 0.01 \
+    --out runs/obstacle-rewards
+
 # run: the policies of steps 6,400 and 4,864
 goal=(--task run --refine --resolutions 8 --steps 9600 --max-episode-steps 800 --success-reward 60 --eval-episodes 8)
 torchmpm train --task run --resolutions 8 --steps 9600 --out runs/run
