@@ -196,7 +196,8 @@ class Solver:
         Args:
             state: The current state.
             actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
-                indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None``: no actuation.
+                indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None``: no actuation. It
+                makes matter stiffer: ``dt`` must not exceed ``stable_dt`` of its largest magnitude.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0). An element whose origin
                 is not finite, or far from its matter, does not move and harms no other.

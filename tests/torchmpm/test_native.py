@@ -14,6 +14,7 @@ from scenes import assert_as_precise, assert_close, assert_identical, lively, no
 
 from torchmpm import Body, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.grid import PAD
+from torchmpm.native import kernels
 from torchmpm.native.kernels import MAX_PARTICLES, MAX_RESOLUTION
 from torchmpm.native.library import find_compiler
 
@@ -173,3 +174,15 @@ for enabled in (True, False):
 def test_a_long_step_can_be_stopped() -> None:
     done = subprocess.run([sys.executable, "-c", ENDLESS], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout == 2 * "stopped\n"
+
+
+@pytest.mark.parametrize("counts", [(640,), (1,) * 100, (65,) * 100])
+def test_gradients_of_long_steps_take_little_memory(counts: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tape has room for blocks of particles, which are those of one body."""
+    monkeypatch.setattr(kernels, "_free_scratch", [])
+    solver = Solver(Grid(16), tuple(Body(count, VonMises(500.0, 50.0, 62.0), 1.0, 1e-3) for count in counts))
+    start = ParticleState.at_rest(normal(1, sum(counts), 2, seed=0).float() * 0.05 + 0.5)
+    start = replace(start, v=start.v.clone().requires_grad_())
+    solver.step(start, substeps=1500).x.sum().backward()
+    (buffer,) = kernels._free_scratch
+    assert buffer.nbytes < 1.1 * kernels.TAPE_BYTES

@@ -51,10 +51,10 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
 
     With e_1 >= e_2 the logarithms of the principal stretches (floored at 0.05), the deviator has the norm
     ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit`` = yield stress / (2 mu), the difference e_1 - e_2 is
-    brought back to its value d at yield and the volume is kept: plastic flow is isochoric. Elsewhere F is returned
-    unchanged. No logarithm and no SVD are needed: with g the geometric mean of the stretches, their sum and difference
-    after the return are 2 g cosh(d/2) and 2 g sinh(d/2), which rescale the two parts of F (see
-    ``torchmpm.materials.linalg``).
+    brought back to its value d at yield and the volume is kept, but for stretches below the floor: plastic flow is
+    isochoric. Elsewhere F is returned unchanged. No logarithm and no SVD are needed: with g the geometric mean of the
+    stretches, their sum and difference after the return are 2 g cosh(d/2) and 2 g sinh(d/2), which rescale the two
+    parts of F (see ``torchmpm.materials.linalg``).
 
     The derivative jumps at the yield surface; exactly on it this returns the elastic side.
 
@@ -96,7 +96,9 @@ class VonMises(Elastic):
     Attributes:
         mu: Second Lame parameter, Pa.
         lam: First Lame parameter, Pa.
-        yield_stress: von Mises yield stress, Pa; the deviatoric strain at yield is ``yield_stress / (2 mu)``.
+        yield_stress: Norm of the deviatoric stress at yield, Pa, at small strain: the largest shear stress is
+            ``yield_stress / sqrt(2)``. What is limited is the norm of the deviatoric logarithmic strain, to
+            ``yield_stress / (2 mu)``; the stress there depends on the change of area too.
 
     Raises:
         ValueError: ``mu`` is not positive, ``lam`` below -mu, or the yield stress negative.

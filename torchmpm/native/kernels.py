@@ -29,6 +29,8 @@ MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: Tape of one simulation on the CPU, bytes: 49 substeps of 22,000 particles in single precision. Longer steps are cut,
 #: alike for any number of threads and simulations, as sums over other pieces would be rounded differently.
 TAPE_BYTES = 2**26
+#: Particles of a body that the kernels for the CPU take together; a last block that is not full takes as much memory.
+LANES = 64
 #: A call on the CPU without gradients is not cut into smaller pieces: as many substeps as a control step has.
 MIN_SUBSTEPS = 100
 #: Share of a GPU's memory that the tape of one simulation may take; as many at once as fit have one.
@@ -122,6 +124,8 @@ class Kernels:
     def tape_limit(self, components: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of components (13, B, N) the adjoint can replay at once, at most ``segment``."""
         rows, _, particles = components.shape
+        if not components.is_cuda:
+            particles = sum(-(-body.count // LANES) * LANES for body in self.bodies)
         substep = components.element_size() * (rows * particles + 3 * self.grid.width**2)
         if components.is_cuda:
             memory = torch.cuda.get_device_properties(components.device).total_memory
