@@ -123,7 +123,7 @@ def _options(env: TorchEnv) -> dict[str, Any]:
         "dtype": str(env.dtype).removeprefix("torch."),
         "resolution": env.action_resolution,
         "action_layout": env.action_layout,
-        "conditions": json.loads(json.dumps(conditions)),
+        "conditions": json.loads(json.dumps(conditions, default=np.generic.item)),
     }
 
 

@@ -75,7 +75,7 @@ def test_time_limits_truncate_what_is_recorded(env):
 def test_episodes_tell_options_of_their_environment(episodes):
     own = episodes[0].environment
     assert (own["particles"], own["substeps"], own["resolution"], own["conditions"]) == ([100], 1, 32, None)
-    changed = dittogym.TorchEnv("shapematch", conditions=dittogym.Conditions(latency=(0, 2)), **OPTIONS)
+    changed = dittogym.TorchEnv("shapematch", conditions=dittogym.Conditions(latency=(0, np.int64(2))), **OPTIONS)
     other = trajectories.record(changed, noise(), max_steps=1).environment
     assert other["conditions"]["latency"] == [0, 2]
     stiffer = dittogym.TorchEnv("shapematch", **OPTIONS)
