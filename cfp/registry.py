@@ -35,6 +35,8 @@ def find(name: str) -> type[Learner]:
     try:
         algorithm = getattr(import_module(module), attribute)
     except Exception as error:  # whatever a user's module does
+        if name in ALGORITHMS:  # a fault of this library
+            raise
         raise ConfigError(f"algo: {name} cannot be imported ({type(error).__name__}: {error})") from error
     if not (isinstance(algorithm, type) and issubclass(algorithm, Learner)):
         raise ConfigError(f"algo must name a subclass of cfp.learner.Learner, got {name!r}")

@@ -279,9 +279,8 @@ class TorchEnv:
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; particles keep their masses and volumes at rest. ``"physics"``:
                 constants of the matter, see :func:`dittogym.physics.physics_values`, used until given again, ``{}``
-                goes back to the task's own;
-                ``"reset_mask"``: (B,) bool, reset only these elements; in an array, a GPU need not be waited for.
-                Later resets reuse values without gradients.
+                goes back to the task's own; ``"reset_mask"``: (B,) bool, reset only these elements; in an array, a GPU
+                need not be waited for. Later resets reuse values without gradients.
 
         Returns:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.

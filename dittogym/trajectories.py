@@ -261,7 +261,8 @@ def _time_limit(env: Any, limit: int) -> int:
         if isinstance(env, TimeLimit) and env.spec and env.spec.max_episode_steps:
             limit = min(limit, env.spec.max_episode_steps)
         elif not isinstance(env, PassiveEnvChecker | OrderEnforcing):
-            raise ValueError(f"env must have no wrappers, which would have no part in it, got {env}; use env.unwrapped")
+            instead = "use env.unwrapped, with max_steps for a time limit"
+            raise ValueError(f"env must have no wrappers, which would have no part in it, got {env}; {instead}")
         env = env.env
     return limit
 

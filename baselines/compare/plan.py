@@ -207,12 +207,14 @@ def make_runs(
             except ConfigError as error:
                 raise ConfigError(f"{label} on {task}: {error}") from error
             found[task, label] = options
-
-    def folder_name(label: str, task: str, seed: int) -> str:
-        return f"{task_name(label)}-{task_name(task)}-{preset}-{seed}"
-
     runs = [
-        PlannedRun(label, task, seed, options | {"seed": seed}, folder / folder_name(label, task, seed))
+        PlannedRun(
+            label,
+            task,
+            seed,
+            options | {"seed": seed},
+            folder / f"{task_name(label)}-{task_name(task)}-{preset}-{seed}",
+        )
         for seed in seeds
         for (task, label), options in found.items()
         if seed == seeds[0] or options["algo"] not in REFERENCE_POLICIES

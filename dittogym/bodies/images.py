@@ -23,7 +23,7 @@ OUTLINE_PIXELS = 512
 DrawingLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]"
 
 
-def read_mask(drawing: DrawingLike, name: str, others: str = "") -> np.ndarray:
+def read_mask(drawing: DrawingLike, name: str, others: str) -> np.ndarray:
     """What is drawn in a picture, or what an outline encloses, (H, W) bool, row 0 at the top.
 
     In a picture with transparent pixels it is what is not transparent; else what is bright, or, where all four corners
