@@ -25,19 +25,15 @@ def largest_piece(x: Tensor, origin: Tensor) -> np.ndarray:
     """
     x_cell, y_cell = ((x - origin[:, None]) * NODES).detach().cpu().numpy().transpose(2, 0, 1)
     robot, particle = np.nonzero((x_cell >= 0) & (x_cell < NODES) & (y_cell >= 0) & (y_cell < NODES))
-    column, row = (cell[robot, particle].astype(np.intp) + 1 for cell in (x_cell, y_cell))
-    full = np.zeros((len(x), NODES + 2, NODES + 2), bool)  # with a margin, so that blocks stay in their window
-    full[robot, column, row] = True
+    cells = robot, *(cell[robot, particle].astype(np.intp) for cell in (x_cell, y_cell))
+    full = np.zeros((len(x), NODES, NODES), bool)
+    full[cells] = True
+    # The same as ndimage.binary_opening, in a tenth of the time.
     corners = full[:, :-1, :-1] & full[:, 1:, :-1] & full[:, :-1, 1:] & full[:, 1:, 1:]  # lower left ones of blocks
     blocks = np.zeros_like(full)
     for i, j in np.ndindex(2, 2):
-        blocks[:, i : i + NODES + 1, j : j + NODES + 1] |= corners
+        blocks[:, i : i + NODES - 1, j : j + NODES - 1] |= corners
     labels, pieces = ndimage.label(blocks, _NEIGHBOURS)
-    piece = labels[robot, column, row]
-    owner = np.zeros(pieces + 1, np.intp)
-    owner[piece] = robot
-    sizes = np.bincount(piece, minlength=pieces + 1)
-    sizes[0] = 0  # what is in no block
-    largest = np.zeros(len(x), np.intp)
-    np.maximum.at(largest, owner, sizes)
-    return largest / x.shape[1]
+    piece = robot * (pieces + 1) + labels[cells]  # 0 of each robot: what is in no block
+    sizes = np.bincount(piece, minlength=len(x) * (pieces + 1)).reshape(len(x), -1)
+    return sizes[:, 1:].max(1, initial=0) / x.shape[1]
