@@ -121,6 +121,9 @@ class Shell:
     def _picture(self, index: int) -> np.ndarray:
         return self.torch_env.render(index, size=self.render_size, muscles=self.render_muscles)
 
+    def _repr_png_(self) -> bytes | None:
+        return self.torch_env._repr_png_()
+
 
 class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
@@ -234,9 +237,6 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         """A policy of one robot, see :meth:`film`, as a function that the batch of one can be driven by."""
         act = as_function(policy, self.torch_env)
         return lambda images: as_tensor(act(images[0]), self.torch_env, single=True)
-
-    def _repr_png_(self) -> bytes | None:
-        return self.torch_env._repr_png_()
 
     @property
     def window_open(self) -> bool:

@@ -189,9 +189,6 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """A picture (S, S, 3) uint8 of ``render_size`` S of each simulation in mode ``"rgb_array"``, else nothing."""
         return None if self.render_mode is None else tuple(map(self._picture, range(self.num_envs)))
 
-    def _repr_png_(self) -> bytes | None:
-        return self.torch_env._repr_png_()
-
 
 def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Info of a step in which some elements (B,) were reset: theirs is that of the reset, without a step's entries."""
