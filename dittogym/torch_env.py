@@ -332,9 +332,7 @@ class TorchEnv:
         before = None if self._env_state is None else self._env_state.conditions
         seeds = varied.next_seeds(self._initial_positions.seeds(seed), before, self.device)
         drawn = varied.draw(self.conditions, seeds, self.action_shape, self._like)
-        if self.conditions.changes(self.spec):
-            physics = varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
-        return drawn, physics
+        return drawn, varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
 
     def _check_stability(self, physics: Physics) -> None:
         """Refuse matter that needs shorter substeps, as it is or with the largest factors of the conditions."""
