@@ -28,11 +28,6 @@ LINES = dict(zip(SEES, ("-", "--", ":", "-."), strict=True))
 RAW = ("task", "observes", "algorithm", "seed", "layout", "return", "success")
 
 
-def paired_differences(ours: dict[int, float], theirs: dict[int, float]) -> list[float]:
-    """Differences between the scores of two algorithms, by seed, in the seeds that both have."""
-    return [ours[seed] - theirs[seed] for seed in sorted(ours.keys() & theirs.keys())]
-
-
 def align(curves: Sequence[Curve]) -> Curve:
     """Interpolate curves linearly onto the steps (T,) that all of them cover, if any: values (runs, T)."""
     first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
@@ -138,7 +133,7 @@ def make_table(results: Sequence[RunResult], first: str, protocol: Protocol) -> 
                 mine = dict.fromkeys(theirs, *scores.values()) if group[0].run.reference else scores
                 if groups[task, first][0].run.reference:
                     theirs = dict.fromkeys(mine, *theirs.values())
-                if differences := paired_differences(mine, theirs):
+                if differences := [mine[seed] - theirs[seed] for seed in sorted(mine.keys() & theirs.keys())]:
                     row |= {"difference": float(np.mean(differences)), "difference_interval": t_interval(differences)}
     noise = {
         "paper": "with action noise as in the paper (none in SHAPE MATCH, that of the policy elsewhere)",
