@@ -21,7 +21,6 @@ from cfp.resumable import Resumable
 from dittogym import TorchEnv, make_spec
 from dittogym.action import bicubic
 from dittogym.observation import soft_silhouette
-from dittogym.spec import TaskSpec
 from dittogym.tasks.shapematch import reward_fn as overlap
 
 #: Of Adam.
@@ -113,7 +112,7 @@ class Objective:
 
     def __init__(self, env: TorchEnv, blur: tuple[float, ...]) -> None:
         self.target: Tensor | None = None
-        if matches_shape(env.spec):
+        if env.spec.target is not None and env.spec.reward_fn is overlap:
             self.target = torch.as_tensor(env.spec.target, device=env.device, dtype=env.dtype)
             self.blurs = [gaussian_matrix(sigma, len(self.target)).to(self.target) for sigma in blur]
 
@@ -128,11 +127,6 @@ class Objective:
         blur = self.blurs[self.phase(progress)]
         difference = soft_silhouette(env.soft_observation()) - self.target
         return (blur @ difference @ blur.T).abs().mean((1, 2))
-
-
-def matches_shape(spec: TaskSpec) -> bool:
-    """Whether the reward of a task is the overlap with its target."""
-    return spec.target is not None and spec.reward_fn is overlap
 
 
 def gaussian_matrix(sigma: float, size: int) -> Tensor:
