@@ -76,7 +76,8 @@ def record(
         policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
         seed: Seed of the reset and of the policy's noise.
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
-        max_steps: Truncate a longer episode after so many steps; ``None``: the time limit of ``env``.
+        max_steps: Truncate a longer episode after so many steps; ``None``: the time limit of ``env``, at most the
+            task's horizon.
 
     Raises:
         TypeError: The environment, the policy or ``fields`` is of another kind.
@@ -258,8 +259,8 @@ def load_minari(dataset_id: str) -> list[Episode]:
 def _time_limit(env: Any, limit: int) -> int:
     """The least of the time limits of an environment's wrappers and ``limit``; refuses other wrappers."""
     while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, TimeLimit) and env.spec and env.spec.max_episode_steps:
-            limit = min(limit, env.spec.max_episode_steps)
+        if isinstance(env, TimeLimit):  # whose specification lacks it where the environment has none
+            limit = min(limit, env.get_wrapper_attr("_max_episode_steps"))
         elif not isinstance(env, PassiveEnvChecker | OrderEnforcing):
             instead = "use env.unwrapped, with max_steps for a time limit"
             raise ValueError(f"env must have no wrappers, which would have no part in it, got {env}; {instead}")

@@ -65,8 +65,9 @@ def test_wrappers_that_would_be_ignored_are_refused():
 
 def test_time_limits_truncate_what_is_recorded(env):
     limited = gymnasium.make(ID, max_episode_steps=10, **OPTIONS)
-    doubly = gymnasium.wrappers.TimeLimit(limited, 4)
-    for given, options, steps in ((limited, {}, 10), (doubly, {}, 4), (limited, {"max_steps": 3}, 3), (env, {}, 30)):
+    doubly, bare = (gymnasium.wrappers.TimeLimit(each, 4) for each in (limited, dittogym.Env("shapematch", **OPTIONS)))
+    own = {"max_steps": 3}
+    for given, options, steps in ((limited, {}, 10), (doubly, {}, 4), (bare, {}, 4), (limited, own, 3), (env, {}, 30)):
         episode = trajectories.record(given, noise(), **options)
         assert episode.truncations.tolist() == [False] * (steps - 1) + [True], steps
         assert len(episode.observations) == len(episode.particles["x"]) == steps + 1
