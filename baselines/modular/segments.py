@@ -19,8 +19,10 @@ from torch.nn.functional import pad
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, patch_corner
+from dittogym.copies import to_device
 from dittogym.geometry import FLOOR_NODE, NODES, centre_in_window
 from dittogym.spec import TaskSpec
+from dittogym.torch_env import find_mask
 from torchmpm import checks, tree
 
 #: Iterations of Lloyd's algorithm in every step: the inertia stays within 1 % of a converged clustering.
@@ -278,8 +280,7 @@ class SegmentedEnv:
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes, see `dittogym.TorchEnv.reset`; returns rows (B, K, columns) and info."""
         _, info = self.env.reset(seed=seed, options=options)
-        mask = (options or {}).get("reset_mask")
-        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device) if mask is None else mask
+        mask = to_device(find_mask("reset_mask", (options or {}).get("reset_mask"), self.num_envs), self.device)
         self.labels = segment(visible_positions(self.env), self.labels, self.nodes.count, mask)
         return self._observe(mask), info
 
