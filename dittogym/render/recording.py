@@ -275,7 +275,9 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
     own = seed if seed is None or np.ndim(seed) == 0 else seed[index]
     yield images, None, None
     while not ended:
-        with torch.random.fork_rng(devices=range(torch.cuda.device_count()), enabled=own is not None):
+        # To read the generator of a GPU that is not in use would occupy it.
+        devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices, enabled=own is not None):
             if own is not None:
                 seed_noise(int(own), step)
             chosen = act(images)
