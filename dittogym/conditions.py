@@ -35,6 +35,8 @@ _CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
 _FACTORS = ("mu", "yield_stress", "gravity")
 #: What an episode draws, in the order of its random numbers.
 _NAMES = ("latency", "action_noise", "action_dropout", "observation_dropout", *_FACTORS, "shift", "turn", "velocity")
+#: Degrees between the directions in which a turned robot is tried.
+TURN_STEP = 11.25
 #: Fields that are not ranges.
 _SINGLE = ("shift", "turn", "velocity", "chance")
 
@@ -257,7 +259,8 @@ def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:
         return
     # Steps of at most half the robot's width, so that it skips nothing that is in the way.
     steps = math.ceil(2.0 * conditions.shift / min(spec.robot.shape.size))
-    turns = np.radians(np.linspace(-conditions.turn, conditions.turn, 9 if conditions.turn else 1))
+    largest = min(conditions.turn, 180.0)  # which is every direction
+    turns = np.radians(np.linspace(-largest, largest, 2 * math.ceil(largest / TURN_STEP) + 1))
     shifts = np.linspace(-conditions.shift, conditions.shift, 2 * steps + 1)
     points = torch.from_numpy(probe(spec.robot))[None]
     for turn, *shift in itertools.product(turns, shifts, shifts):

@@ -194,7 +194,7 @@ VALUES = [
     ("matter stable, got {'mu': (1.0, 500.0)}, with which dt must be at most", lambda: grow(mu=(1.0, 500.0))),
     ("matter stable", lambda: grow(gravity=1e6)),
     ("robot room, got shift=0.2 and turn=0", lambda: grow(shift=0.2)),
-    ("the obstacle 'right beam'", lambda: grow(turn=45.0)),
+    *(("the obstacle 'right beam'", lambda turn=turn: grow(turn=turn)) for turn in (45.0, 180.0, 720.0)),
     ("place of the object", lambda: env(task="kick", conditions={"shift": 0.15})),
     # Between the largest shifts, where the robot is behind the object or the stair; and with the object left behind.
     ("place of the object", lambda: env(task="kick", conditions={"shift": 0.4})),
