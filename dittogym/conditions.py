@@ -138,7 +138,8 @@ def as_conditions(given: Any) -> Conditions | None:
 def _checked(name: str, value: Any) -> float:
     if name == "latency":
         return checks.whole(name, value, 0)
-    highest = {"action_dropout": 1.0, "observation_dropout": 1.0, "chance": 1.0}.get(name, math.inf)
+    # The window is 1 m high.
+    highest = dict.fromkeys(("action_dropout", "observation_dropout", "chance", "shift"), 1.0).get(name, math.inf)
     checks.number(name, value, **({"above": 0.0} if name == "mu" else {"least": 0.0}))
     if value > highest:
         raise ValueError(f"{name} must be at most {highest:g}, got {value}")

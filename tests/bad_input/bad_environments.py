@@ -187,6 +187,7 @@ VALUES = [
     ("mu must be positive", lambda: grow(mu=0.0)),
     ("yield_stress must be a number", lambda: grow(yield_stress="1")),
     ("shift must be a number, got (0.0, 0.1)", lambda: grow(shift=(0.0, 0.1))),
+    ("shift must be at most 1", lambda: grow(shift=1.5)),
     ("chance", lambda: grow(chance=1.1)),
     *(("grid", lambda size=size: grow(grid=size)) for size in (0, 9)),
     ("'friction'", lambda: grow(friction=1.0)),
