@@ -246,10 +246,10 @@ def physics_of(conditions: Conditions, drawn: Drawn, spec: TaskSpec, physics: Ph
     return {**physics, **changed}
 
 
-def largest_physics(conditions: Conditions, spec: TaskSpec, physics: Physics, like: Tensor) -> Physics:
-    """Constants of the matter with the largest factors, for B simulations."""
-    largest = {name: torch.full_like(like, conditions.bounds(name)[1]) for name in _FACTORS}
-    return physics_of(conditions, largest, spec, physics, like)
+def extreme_physics(conditions: Conditions, end: int, spec: TaskSpec, physics: Physics, like: Tensor) -> Physics:
+    """Constants of the matter with the smallest factors, ``end`` 0, or the largest, 1, for B simulations."""
+    factors = {name: torch.full_like(like, conditions.bounds(name)[end]) for name in _FACTORS}
+    return physics_of(conditions, factors, spec, physics, like)
 
 
 def check_fit(conditions: Conditions, spec: TaskSpec, resolution: int) -> None:

@@ -335,12 +335,14 @@ class TorchEnv:
         return drawn, varied.physics_of(self.conditions, drawn, self.spec, physics, self._like)
 
     def _check_stability(self, physics: Physics) -> None:
-        """Refuse matter that needs shorter substeps, as it is or with the largest factors of the conditions."""
+        """Refuse matter that needs shorter substeps, as it is or with factors at the ends of the conditions."""
         core.check_stability(self.model, physics)
         if self.conditions is None:
             return
         try:
-            core.check_stability(self.model, varied.largest_physics(self.conditions, self.spec, physics, self._like))
+            for end in (0, 1):  # a small mu is unstable with a negative lam
+                extreme = varied.extreme_physics(self.conditions, end, self.spec, physics, self._like)
+                core.check_stability(self.model, extreme)
         except ValueError as error:
             changed = {name: getattr(self.conditions, name) for name in self.conditions.changes(self.spec)}
             raise ValueError(f"conditions must leave the matter stable, got {changed}, with which {error}") from error

@@ -194,6 +194,7 @@ VALUES = [
     ("conditions", lambda: env(conditions=0.5)),
     ("matter stable, got {'mu': (1.0, 500.0)}, with which dt must be at most", lambda: grow(mu=(1.0, 500.0))),
     ("matter stable", lambda: grow(gravity=1e6)),
+    ("matter stable", lambda: grow(mu=(0.5, 1.0)).reset(options={"physics": {"lam": -300.0}})),
     ("robot room, got shift=0.2 and turn=0", lambda: grow(shift=0.2)),
     *(("the obstacle 'right beam'", lambda turn=turn: grow(turn=turn)) for turn in (45.0, 180.0, 720.0)),
     ("place of the object", lambda: env(task="kick", conditions={"shift": 0.15})),
