@@ -106,7 +106,8 @@ class Reward(NamedTuple):
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
         task_state: Replaces the task's state, leading B, with the same names and shapes; ``None`` keeps it. Tensors of
-            int64 of shape (B, K) hold particle indices, which planners with fewer particles translate.
+            int64 of shape (B, K) hold particle indices, in place of which planners with fewer particles keep their own
+            from the start of the episode.
     """
 
     terms: Mapping[str, Tensor]
