@@ -74,7 +74,7 @@ def _as_text(value: Any) -> str:
         return _as_text([value.func, value.args, value.keywords])
     if callable(value):
         return str(getattr(value, "__qualname__", type(value).__name__))
-    text = repr(value)
+    text = repr(value.item() if isinstance(value, np.generic) else value)
     return type(value).__name__ if " at 0x" in text else text  # an address differs in another process
 
 
