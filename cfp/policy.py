@@ -290,7 +290,7 @@ def _check_description(description: Any) -> None:
     """Check the entries of a description that every kind of policy has, and bring older ones up to date."""
     known = isinstance(description, dict) and description.get("format") == FORMAT
     if not known or description.get("version") != VERSION:
-        raise ConfigError(f"the file must have a {FORMAT} description of version {VERSION}")
+        raise ConfigError(f"description must be that of a {FORMAT} of version {VERSION}, see cfp.policy.describe_run")
     for name, allowed in _DESCRIBED.items():
         value = description.get(name)
         if name in _OPTIONAL and value is None:
@@ -328,11 +328,12 @@ def write_policy(
     For ``shared`` see `cfp.files.write_atomically`.
 
     Raises:
-        ConfigError: ``path`` does not end in ``.safetensors``.
+        ConfigError: ``path`` does not end in ``.safetensors``, or the description is not one that can be read back.
     """
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ConfigError(f"path must end in .safetensors, got {str(path)!r}")
+    _check_description(copy.deepcopy(description))  # which it brings up to date
     description = _translated(description, {own: word for word, own in _ENCODERS.items()})
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})

@@ -1,8 +1,11 @@
-"""Policy files as a training of the coarse-to-fine policy writes them."""
+"""Policy files as a training of the coarse-to-fine policy writes them, and as anybody may."""
 
+import json
 from dataclasses import asdict
 
-from cfp.policy import KIND, describe_run, write_policy
+import safetensors.torch
+
+from cfp.policy import FORMAT, KIND, describe_run, write_policy
 
 
 def describe_actor(config, stage, steps):
@@ -11,3 +14,8 @@ def describe_actor(config, stage, steps):
 
 def save_actor(path, actor, config, stage, steps):
     write_policy(path, actor.state_dict(), describe_actor(config, stage, steps))
+
+
+def write_stranger(path, tensors, description):
+    """Any weights with any description, in the format of policies."""
+    safetensors.torch.save_file(tensors, path, {FORMAT: json.dumps(description)})

@@ -15,6 +15,7 @@ from cfp.config import TASK_OPTIONS, RunConfig
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
+from dittogym.render.recording import generators_kept
 from dittogym.torch_env import find_device
 from torchmpm.solver import kernels_fail
 
@@ -78,7 +79,7 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed torch's generators of all devices, and restore them afterwards."""
-    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+    """Seed torch's generators, and restore them afterwards."""
+    with generators_kept():
         torch.manual_seed(seed)
         yield

@@ -32,7 +32,7 @@ from dittogym.action import trained_layout
 from dittogym.copies import to_device, to_host
 from dittogym.env import as_numpy
 from dittogym.pieces import largest_piece
-from dittogym.render.recording import attached, seed_noise
+from dittogym.render.recording import attached, generators_kept, seed_noise
 from dittogym.spec import TaskSpec
 from torchmpm import checks
 
@@ -361,7 +361,7 @@ def evaluate(
         bar.update(steps * count - taken)
         return episodes
 
-    with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:
+    with bar, generators_kept(), ThreadPoolExecutor(workers or 1) as pool:
         futures = [pool.submit(play_span, *span) for span in spans]
         try:
             for future in wait(futures, return_when=FIRST_EXCEPTION).done:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
 from html import escape
 from itertools import islice
@@ -120,7 +121,8 @@ class Recording:
             legend: Say below the caption what the colours mean.
 
         Raises:
-            ValueError: ``time``, ``size`` or ``zoom`` is not a number in its range, or ``muscles`` not True or False.
+            ValueError: ``time`` is not a number, ``size`` or ``zoom`` is out of range, or ``muscles`` is not True or
+                False.
         """
         checks.number("time", time)
         at = float(np.clip(time / self.scene.dt, 0, len(self.shots) - 1))
@@ -275,9 +277,7 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
     own = seed if seed is None or np.ndim(seed) == 0 else seed[index]
     yield images, None, None
     while not ended:
-        # To read the generator of a GPU that is not in use would occupy it.
-        devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-        with torch.random.fork_rng(devices, enabled=own is not None):
+        with generators_kept(own is not None):
             if own is not None:
                 seed_noise(int(own), step)
             chosen = act(images)
@@ -290,6 +290,13 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
         images, ended = observation.cpu().numpy(), bool(end[1][index] | end[2][index])
         action = action.float() if action.dtype == torch.bfloat16 else action  # which NumPy does not have
         yield images, action.cpu().numpy(), end
+
+
+def generators_kept(enabled: bool = True) -> AbstractContextManager[None]:
+    """Restore torch's generators at the end, if ``enabled``."""
+    # To read the generator of a GPU that is not in use would occupy it.
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+    return torch.random.fork_rng(devices, enabled)
 
 
 def seed_noise(seed: int, step: int) -> None:

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from policy_files import write_stranger
+
 from cfp import train
-from cfp.policy import SHIPPED, read_policy, write_policy
+from cfp.policy import SHIPPED, read_policy
 
 TINY = (
     "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 "
@@ -53,7 +55,7 @@ class Desk:
     ) -> None:
         """Write the shipped policy of RUN with another description and other weights."""
         tensors, description = read_policy(SHIPPED / "run.safetensors")
-        write_policy(self.folder / f"{name}.safetensors", weights(tensors), {**description, **(changes or {})})
+        write_stranger(self.folder / f"{name}.safetensors", weights(tensors), {**description, **(changes or {})})
         self.before = snapshot(self.folder)
 
 

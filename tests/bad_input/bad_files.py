@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 from bad_cases import TINY, Case, Refused, command, prepared, table
+from policy_files import write_stranger
 
 import baselines.registry
 import cfp
@@ -18,7 +19,7 @@ import cfp.train
 from baselines.modular.learner import ModularConfig
 from cfp.agent.actor import ActorSpec
 from cfp.errors import CheckpointError
-from cfp.policy import read_policy, write_policy
+from cfp.policy import read_policy
 from cfp.train import from_python
 from dittogym import make_spec
 
@@ -102,9 +103,9 @@ POLICIES = [
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
     policy("with a tensor of terabytes", "damaged", content=header(HUGE)),
-    policy("without a description", "must have a cfp-policy description", content=header({})),
+    policy("without a description", "description must be that of a cfp-policy", content=header({})),
     policy("with a deep description", "damaged", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})),
-    policy("of another version", "description of version 1", changes={"version": 2}),
+    policy("of another version", "cfp-policy of version 1", changes={"version": 2}),
     policy("of another kind", "kind must be", "'mpc'", changes={"kind": "mpc"}),
     policy("of a task by number", "task must be of type str, got 3", changes={"task": 3}),
     policy("of no grid", "resolution must be between 1 and 128, got 0", changes={"resolution": 0}),
@@ -282,7 +283,7 @@ def described(**changes):
     def change(folder):
         path = folder / "policy.safetensors"
         tensors, description = read_policy(path)
-        write_policy(path, tensors, description | changes)
+        write_stranger(path, tensors, description | changes)
 
     return change
 
