@@ -287,6 +287,16 @@ def test_robots_are_segmented_anew_where_their_episode_begins_and_nowhere_else()
     assert np.array_equal(labels[0], first[0]) and (labels[1] == memory[0][1]).mean() > 0.9
 
 
+@pytest.mark.parametrize("kind", [torch.tensor, np.array, list])
+def test_a_mask_may_lie_elsewhere_than_the_robots(kind):
+    """Autoreset gives one on the host, whatever the device."""
+    env = segmented(num_envs=3, substeps=2)
+    first, _ = env.reset(seed=0)
+    moved = env.step(2.0 * torch.rand(3, 16, 2, generator=seeded()) - 1.0)[0]
+    rows, _ = env.reset(options={"reset_mask": kind([True, False, True])})
+    assert torch.equal(rows[[0, 2]], first[[0, 2]]) and torch.equal(rows[1], moved[1])
+
+
 def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
     policy = untrained()
     with pytest.raises(RuntimeError, match="attached"):
