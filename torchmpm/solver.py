@@ -284,8 +284,12 @@ class Solver:
             return f"it does not call {type(self).__name__}.{self._overridden}"
         if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        if tree.has_tangents((*vars(state).values(), *fields, *self.constants.values())):
+        given = [t for t in (*vars(state).values(), *fields, *self.constants.values()) if t is not None]
+        if tree.has_tangents(given):
             return "it has no forward-mode derivatives"
+        for tensor in given:  # a null pointer would kill the process
+            if type(tensor).__torch_dispatch__ is not Tensor.__torch_dispatch__:
+                return f"its kernels read memory, which a {type(tensor).__name__} may not have"
         return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:

@@ -192,6 +192,18 @@ def test_other_defaults_of_torch_change_nothing(fresh_process: None) -> None:
         assert_identical(robot(20, backend="auto").step(state, drive, substeps=2), expected)
 
 
+def test_tensors_without_numbers_take_an_eager_step(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
+    """The kernels would read from a null pointer."""
+    fake, state = FakeTensorMode(), lively(5)
+    with fake:
+        imagined = tree.map(fake.from_tensor, state)
+        assert robot(5, backend="auto").step(imagined, substeps=2).x.shape == state.x.shape
+        if find_compiler():
+            with pytest.raises(ValueError, match="FakeTensor"):
+                robot(5, backend="native").step(imagined)
+    assert "FakeTensor" in messages(caplog)[0]
+
+
 @pytest.mark.cuda
 def test_cuda_equals_cpu() -> None:
     """To 1e-10 in double precision: only the order of the sums on the nodes differs."""
