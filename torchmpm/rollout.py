@@ -52,7 +52,8 @@ def repeated(
     if shared is not None and segment < times:
         tree.check_open("shared", shared)
         tree.check_open("state", state)
-        if not tree.has_tangents(tree.leaves((shared, state))):
+        tensors = tree.leaves((shared, state))
+        if not tree.has_tangents(tensors) and not _autocast(tensors):
             checkpointed = _replayed
     for start in range(0, times, segment):
         run = partial(_run, step, min(segment, times - start))
@@ -106,6 +107,12 @@ def _run(step: Callable[..., State], times: int, *arguments: Any) -> State:
 def _records() -> bool:
     """Whether a graph is recorded that checkpoints can shorten; torch's transforms and compiler have no checkpoints."""
     return torch.is_grad_enabled() and not transforming() and not torch.compiler.is_compiling()
+
+
+def _autocast(tensors: Iterable[Tensor]) -> bool:
+    """Whether autocast is on where the tensors are; :func:`_replayed` would replay without it, in another dtype."""
+    kinds = {tensor.device.type for tensor in tensors}
+    return any(torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind) for kind in kinds)
 
 
 def _checkpointed(function: Callable[..., State], *arguments: Any) -> State:

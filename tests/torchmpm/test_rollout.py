@@ -322,6 +322,25 @@ def test_constants_that_a_step_makes_itself_are_made_again(backend: str) -> None
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=0)
 
 
+@pytest.mark.parametrize("given", ["shared", "closure"])
+def test_a_replay_is_in_the_precision_of_the_step(given: str) -> None:
+    """That of autocast, which has ended when the replay begins."""
+    weights, x = normal(8, 8, seed=0, dtype=torch.float32).requires_grad_(), normal(4, 8, seed=1, dtype=torch.float32)
+
+    def step(weights: Tensor, x: Tensor) -> Tensor:
+        return torch.tanh(0.3 * (x @ weights).float())
+
+    gradients = []
+    for segment in (None, 2):
+        with torch.autocast("cpu", torch.bfloat16):
+            if given == "shared":
+                final = repeated(step, x, 6, segment=segment, shared=weights)
+            else:
+                final = repeated(partial(step, weights), x, 6, segment=segment)
+        gradients += torch.autograd.grad(final.square().sum(), weights)
+    assert torch.equal(*gradients)
+
+
 def test_a_state_of_inference_mode_is_replayed() -> None:
     solver = replace(robot(20), backend="eager")
     with torch.inference_mode():
