@@ -17,8 +17,8 @@ from torchmpm.substep import free_velocity, grid_velocity, particles_to_grid
 
 def inside(solver: Solver, state: ParticleState, origin: Tensor | None = None) -> Tensor:
     """Which particles are in the window, whose lower left corner is at ``origin`` (B, 2), m, and move; (B, N) bool."""
-    _check(solver, state)
-    at = state.x.new_zeros(state.batch_size, 2) if origin is None else origin
+    checks.instance("solver", solver, Solver)
+    at = solver.check_arguments(state, None, origin)
     return solver.grid.takes_part(state.x[..., 0], state.x[..., 1], at)
 
 

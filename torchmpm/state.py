@@ -38,7 +38,7 @@ class ParticleState:
     Raises:
         ValueError: A field has the wrong shape, is neither float32 nor float64, or dtype or device differ between
             fields.
-        TypeError: A field is not a tensor.
+        TypeError: A field is not a dense tensor.
 
     Examples:
         >>> import torch, torchmpm
@@ -54,14 +54,14 @@ class ParticleState:
     Jp: Float[Tensor, "B N"]
 
     def __post_init__(self) -> None:
-        checks.instance("x", self.x, Tensor)
+        checks.tensor("x", self.x)
         if self.x.ndim != 3 or self.x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2), got {tuple(self.x.shape)}")
         if self.x.dtype not in (torch.float32, torch.float64):  # half precision would lose what a substep adds
             raise ValueError(f"x must be float32 or float64, got {self.x.dtype}")
         for name, trailing in _TRAILING.items():
             field = getattr(self, name)
-            checks.instance(name, field, Tensor)
+            checks.tensor(name, field)
             if field.shape != (*self.x.shape[:2], *trailing):
                 raise ValueError(
                     f"{name} must have shape {(*self.x.shape[:2], *trailing)} to go with x of shape "

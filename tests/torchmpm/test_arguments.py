@@ -151,7 +151,10 @@ VALUES = {
         lambda s=s: lively(5).where(torch.tensor([True]), s)
         for s in (lively(5, 3), lively(4), lively(5).to(torch.float32))
     ],
-    "origin": [lambda: step(origin=torch.zeros(2).double())],
+    "origin": [
+        lambda: step(origin=torch.zeros(2).double()),
+        lambda: diagnostics.inside(solver(), lively(5), torch.zeros(2).double()),
+    ],
     "x": [
         *(lambda s=s: state(x=torch.zeros(s)) for s in ((5, 3), (5,), (2, 5, 1), (1, 2, 5, 2))),
         *(lambda t=t: lively(4, 3).to(t) for t in (torch.float16, torch.int64)),
@@ -195,7 +198,11 @@ TYPES = {
         lambda: repeated(lambda _, s: s, Hidden(torch.ones(1)), 3, segment=1, shared=torch.ones(1)),
     ],
     "solver": [lambda: diagnostics.momentum(None, lively(5))],
-    "x": [lambda x=x: ParticleState.at_rest(x) for x in (np.zeros((5, 2)), torch.zeros(1, 5, 2).to_sparse())],
+    "x": [
+        *(lambda x=x: ParticleState.at_rest(x) for x in (np.zeros((5, 2)), torch.zeros(1, 5, 2).to_sparse())),
+        lambda: state(x=lively(5).x.to_sparse()),
+    ],
+    "v": [lambda: state(v=lively(5).v.to_sparse())],
     "actuation": [lambda: step(lively(5), FIELD.to_sparse())],
     "mask": [lambda: lively(5).where([True], lively(5))],
     "shared": [lambda: repeated(lambda net, x: net(x), torch.ones(1), 3, segment=1, shared=torch.nn.Linear(1, 1))],
