@@ -225,11 +225,11 @@ class Solver:
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         self._try_laws(state)
         scene = self.scene(state, actuation, origin)
+        step = partial(substep, boundary=self.boundary)
         if self._reads_scene_alone:
-            end = repeated(substep, state.components(), substeps, segment=segment, shared=scene)
+            end = repeated(step, state.components(), substeps, segment=segment, shared=scene)
         else:
-            own = partial(substep, scene, boundary=self.boundary)
-            end = repeated(own, state.components(), substeps, segment=segment)
+            end = repeated(partial(step, scene), state.components(), substeps, segment=segment)
         return ParticleState.from_stack(torch.stack(end))
 
     def boundary(self, scene: Scene, velocity: Tensor) -> Tensor:

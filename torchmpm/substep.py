@@ -6,13 +6,13 @@ particles.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchmpm import transfer, tree
-from torchmpm.boundary import Face, constrain
+from torchmpm.boundary import Face
 from torchmpm.grid import Grid
 from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body, slices
@@ -43,9 +43,6 @@ class Scene:
     actuation: Tensor | None  # (2, B, cells) on the nodes, Pa
 
 
-Boundary: TypeAlias = Callable[[Scene, Tensor], Tensor]
-
-
 class Scattered(NamedTuple):
     """Result of the first half of a substep."""
 
@@ -56,16 +53,14 @@ class Scattered(NamedTuple):
     momentum: Tensor  # (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes
 
 
-def substep(scene: Scene, state: Components, boundary: Boundary | None = None) -> Components:
+def substep(scene: Scene, state: Components, boundary: Callable[[Scene, Tensor], Tensor]) -> Components:
     """Advance all particles by one substep: from components (B, N) to components (B, N).
 
-    ``boundary`` is what the surroundings do to the velocities of the nodes, see :meth:`torchmpm.Solver.boundary`; by
-    default the velocity rules of the scene.
+    ``boundary`` is what the surroundings do to the velocities of the nodes, see :meth:`torchmpm.Solver.boundary`.
     """
     state = _detach_unresolved(scene, state)
     scattered = particles_to_grid(scene, state)
-    velocity = grid_velocity(scene, scattered.momentum)
-    velocity = constrain(scene.faces, velocity) if boundary is None else boundary(scene, velocity)
+    velocity = boundary(scene, grid_velocity(scene, scattered.momentum))
     v, C = transfer.grid_to_particles(scene.grid, scattered.nodes, velocity)
     x, y = state[:2]
     moved = (x + scene.dt * v[0], y + scene.dt * v[1], *v, *C, *scattered.F, scattered.Jp)
