@@ -3,9 +3,8 @@
 # of the step that a comment names.
 set -e
 
-# run-rewards
-torchmpm train --task run --algo cfp-sac --preset long --resolutions 4 --steps 160000 --seed 1 \
-    --critics-first 0.0027466 --out runs/run-rewards
+# run-rewards: the policy of step 140,000
+torchmpm train --task run --algo cfp-sac --preset long --resolutions 4 --steps 160000 --seed 1 --out runs/run-rewards
 
 # obstacle-rewards: the policy of step 150,000
 torchmpm train --task obstacle --algo cfp-sac --preset long --resolutions 4 --steps 160000 --critics-first 0.01 \
