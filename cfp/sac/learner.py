@@ -464,6 +464,8 @@ class CFP(SAC):
         resets = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if resets:
+            assert isinstance(self.replay_buffer, ReplayRing)
+            self.replay_buffer.cut()
             self._last_obs = self._prepared(self._last_obs)
         return result
 

@@ -144,6 +144,12 @@ class ReplayRing(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
 
+    def cut(self) -> None:
+        """Let sums of rewards end with the newest transitions, as at a time limit: the environment is reset now."""
+        newest = self.pos - 1  # of an empty memory a row that is written later
+        self.timeouts[newest] += 1 - self.dones[newest]
+        self.dones[newest] = 1
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch uniformly; from arrays without replacement if at least ``batch_size`` transitions are stored."""
         first = self._draw(batch_size)

@@ -331,6 +331,19 @@ def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
         assert np.array_equal(batch.next_observations[index].numpy(), following)
 
 
+def test_sums_end_where_another_learn_begins_with_a_reset():
+    env, options = FakeEnv(num_envs=2, resolution=4, horizon=9), {"n_steps": 3, "gamma": 0.5, "update_start": 100}
+    model = make_model(ActorSpec((4,)), env, random_steps=100, **options)
+    model.learn(8)
+    model.learn(8)  # which resets the environment
+    buffer = model.replay_buffer
+    buffer.rewards[4:] = 1e6  # of the episodes after the reset
+    sums, last, discounts = buffer._look_ahead(np.arange(8))
+    assert sums.max() < 10 and last.max() < 8
+    assert discounts.tolist() == [0.125] * 4 + [0.25] * 2 + [0.5] * 2
+    assert not (buffer.dones * (1 - buffer.timeouts)).any()  # what follows is valued
+
+
 def test_sums_that_end_early_are_normalised_like_whole_ones(monkeypatch):
     model, seen = sums_ahead(), []
     model.replay_buffer.rewards[:] = 2.0
