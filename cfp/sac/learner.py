@@ -478,17 +478,16 @@ class CFP(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        # stable-baselines3's own would store images as they are beneath a VecNormalize, not as networks get them.
         new_obs = self._prepared(new_obs)
-        for info in infos:
-            if "terminal_observation" in info:
-                info["terminal_observation"] = self._prepared(info["terminal_observation"])
-        if not self.on_device:
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-            return
         next_obs, ended = new_obs, np.flatnonzero(dones)
         if len(ended):
-            finals = np.stack([infos[index]["terminal_observation"] for index in ended])
-            next_obs = new_obs.index_copy(0, to_device(ended, self.device), to_device(finals, self.device))
+            finals = self._prepared(np.stack([infos[index]["terminal_observation"] for index in ended]))
+            if self.on_device:
+                next_obs = new_obs.index_copy(0, to_device(ended, self.device), to_device(finals, self.device))
+            else:
+                next_obs = new_obs.copy()
+                next_obs[ended] = finals
         replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
         self._last_obs = new_obs
 

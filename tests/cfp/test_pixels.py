@@ -7,6 +7,7 @@ import pytest
 import torch
 from policy_files import save_actor
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecNormalize
 
 import cfp
 from cfp import CFP, ActorPolicy, ActorSpec, CFPAnalytic, CFPPolicy, Hyperparameters
@@ -97,9 +98,25 @@ def test_all_ways_to_act_by_a_policy_fill_images_once():
     assert not np.array_equal(plain.predict(images.numpy(), deterministic=True)[0], wanted)
 
 
-@pytest.mark.parametrize("tensors", [False, True])
-@pytest.mark.parametrize("noise_cells", [0, 2])
-def test_soft_actor_critic_acts_on_and_remembers_filled_images(tensors, noise_cells, looks, monkeypatch):
+def as_it_is(env):
+    return env
+
+
+def with_scaled_rewards(env):
+    return VecNormalize(env, norm_obs=False)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "noise_cells", "wrap"),
+    [
+        (False, 0, as_it_is),
+        (False, 2, as_it_is),
+        (True, 0, as_it_is),
+        (True, 2, as_it_is),
+        (False, 2, with_scaled_rewards),
+    ],
+)
+def test_soft_actor_critic_acts_on_and_remembers_filled_images(tensors, noise_cells, wrap, looks, monkeypatch):
     """Each filled once: those of the environment, and the last ones of episodes; also when it goes on learning."""
     seen, last = [], {}
 
@@ -118,7 +135,8 @@ def test_soft_actor_critic_acts_on_and_remembers_filled_images(tensors, noise_ce
     monkeypatch.setattr(TorchVecEnv, "step_wait", step_wait)
     env = TorchEnv("run", 2, 4, particles=2000, substeps=1, conditions=LOST)
     own = Hyperparameters(buffer_size=40, batch_size=8, update_start=1_000, random_steps=0, noise_cells=noise_cells)
-    model = CFP(CFPPolicy, monitored(env, 4, tensors), own, seed=0, device="cpu", policy_kwargs={"spec": SPEC})
+    env = wrap(monitored(env, 4, tensors))
+    model = CFP(CFPPolicy, env, own, seed=0, device="cpu", policy_kwargs={"spec": SPEC})
     model.set_logger(Logger(None, []))
     for _ in range(2):
         model.learn(6, reset_num_timesteps=False)
