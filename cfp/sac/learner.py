@@ -523,6 +523,8 @@ class CFP(SAC):
         """Continue from the ``state`` of `state_dict`."""
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
+        if state["actor_optimizer"]["state"]:  # in a stage that was prolonged an actor that learns goes on to learn
+            self.hyperparameters = replace(self.hyperparameters, actor_start=0)
         self._episode_num, self._n_updates = state["episodes"], state["updates"]
         self.ep_info_buffer = deque(state["recent"], maxlen=self._stats_window_size)
         self.ep_success_buffer = deque(state["successes"], maxlen=self._stats_window_size)

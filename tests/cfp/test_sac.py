@@ -474,3 +474,17 @@ def test_actor_starts_after_the_critics_and_rates_fall():
     assert moved == [(steps, steps >= 10) for steps in range(6, 25, 2)]
     assert rates[-1] == pytest.approx([3e-5, 3e-5], rel=1e-6)
     assert rates == sorted(rates, reverse=True)
+
+
+@pytest.mark.parametrize(("taken", "goes_on"), [(8, False), (14, True)])
+def test_actor_that_learns_goes_on_to_learn_in_a_prolonged_stage(taken, goes_on):
+    options = {"update_start": 4, "batch_size": 4}
+    model = make_model(ActorSpec((8,)), **options, actor_start=10)
+    model.learn(taken)
+    prolonged = make_model(ActorSpec((8,)), **options, actor_start=100)
+    prolonged.load_state_dict(model.state_dict())
+    prolonged.num_timesteps = taken
+    weight = prolonged.networks()[0].mean[0].weight
+    before = weight.clone()
+    prolonged.learn(6, reset_num_timesteps=False)
+    assert torch.equal(weight, before) != goes_on
