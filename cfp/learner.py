@@ -213,14 +213,15 @@ class UpdateLoop(BaseAlgorithm, Learner):
         a second stage that is prolonged.
         """
         resets = reset_num_timesteps or self._last_obs is None  # as `_setup_learn` does
-        total, self._callback = self._setup_learn(
+        # Callbacks find the name, which stands for all steps then, among the locals.
+        total_timesteps, self._callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         if resets:
             self.begin_episodes()
         self._callback.on_training_start(locals(), globals())
-        updates, end = 0, max(total, self.config.stage_steps(self.stage))
-        while self.num_timesteps < total:
+        updates, end = 0, max(total_timesteps, self.config.stage_steps(self.stage))
+        while self.num_timesteps < total_timesteps:
             self._callback.on_rollout_start()
             self.progress = self.num_timesteps / end
             if not self.update():

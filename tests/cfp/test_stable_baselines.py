@@ -62,6 +62,9 @@ class Steps(BaseCallback):
         super().__init__()
         self.last, self.steps, self.ends, self.began, self.ended = last, [], [], 0, 0
 
+    def _on_training_start(self):
+        self.total = self.locals["total_timesteps"]  # as stable-baselines3's progress bar does
+
     def _on_rollout_start(self):
         self.began += 1
 
@@ -82,9 +85,10 @@ def test_callbacks_are_called_once_for_each_step_of_all_robots_and_may_stop(algo
     model.learn(64, seen)
     assert seen.steps == list(range(2, 23, 2)) and model.num_timesteps == 22
     assert seen.ends == [(3, 3), (6, 6), (9, 6)]
-    assert seen.began >= seen.ended >= 2
-    model.learn(8, reset_num_timesteps=False)
-    assert model.num_timesteps >= 30
+    assert seen.began >= seen.ended >= 2 and seen.total == 64
+    more = Steps(last=64)
+    model.learn(8, more, reset_num_timesteps=False)
+    assert model.num_timesteps >= 30 and more.total == 30
     model.learn(64, StopTrainingOnMaxEpisodes(3))
     assert model.num_timesteps == 36  # it stops after three episodes of each robot
 
