@@ -186,8 +186,10 @@ class UpdateLoop(BaseAlgorithm, Learner):
     @property
     def simulation(self) -> TorchEnv:
         """The environment in torch, for gradients."""
-        assert self.env is not None
-        simulation: TorchEnv = cast(TorchVecEnv, self.env.unwrapped).torch_env
+        env = getattr(self.env, "unwrapped", None)
+        if not isinstance(env, TorchVecEnv):  # stable-baselines3 makes another one of a Gymnasium environment
+            raise TypeError(f"env must be a TorchVecEnv, got {env!r}")
+        simulation: TorchEnv = env.torch_env
         return simulation
 
     def begin_episodes(self) -> None:

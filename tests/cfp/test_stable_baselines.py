@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -91,6 +92,12 @@ def test_callbacks_are_called_once_for_each_step_of_all_robots_and_may_stop(algo
     assert model.num_timesteps >= 30 and more.total == 30
     model.learn(64, StopTrainingOnMaxEpisodes(3))
     assert model.num_timesteps == 36  # it stops after three episodes of each robot
+
+
+def test_gradients_need_an_environment_in_torch():
+    env = gymnasium.make("dittogym/shapematch-coarse-v0", resolution=8, particles=100, substeps=1)
+    with pytest.raises(TypeError, match=r"env must be a TorchVecEnv, got <.*DummyVecEnv"):
+        CFPAnalytic("NetworksPolicy", env, CONFIG, device="cpu")
 
 
 @pytest.mark.parametrize("algorithm", [CFP, CFPAnalytic])
