@@ -107,6 +107,8 @@ def test_rows_are_kept_until_the_policy_or_the_number_of_episodes_is_another(fol
 
     assert command(folder, table, short) == 0
     assert table.read_text() == first and played() == 0
+    table.write_text(first, encoding="utf-8-sig")  # as a spreadsheet saves it
+    assert command(folder, table, short) == 0 and played() == 0
     assert command(folder, table, short.replace("--episodes 2", "--episodes 3")) == 0
     assert played() == 3 and len(rows_of(table)) == 4
     save(folder, steps=1)
