@@ -26,11 +26,9 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
 class CSVTable:
     """A CSV file that grows row by row, also over several sessions, and can take new columns on the way."""
 
-    def __init__(self, path: Path, last_step: int | None = None, numbers: Sequence[str] = ("step",)) -> None:
+    def __init__(self, path: Path, last_step: int, numbers: Sequence[str] = ("step",)) -> None:
         self.path = path
-        self.rows = read_table(path, numbers)
-        if last_step is not None:
-            self.rows = [row for row in self.rows if float(row["step"]) <= last_step]
+        self.rows = [row for row in read_table(path, numbers) if float(row["step"]) <= last_step]
         self.columns = list(dict.fromkeys(key for row in self.rows for key in row))
         if self.columns or path.exists():
             self._rewrite()

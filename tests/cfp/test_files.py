@@ -37,7 +37,7 @@ def test_two_may_write_the_same_file(tmp_path):
 
 
 def test_table_grows_rows_and_columns(tmp_path):
-    table = CSVTable(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv", last_step=0)
     table.add({"step": 1, "a": 0.5})
     table.add({"step": 2, "a": None})
     table.add({"step": 3, "a": 1, "b": "x,y"})
@@ -45,7 +45,7 @@ def test_table_grows_rows_and_columns(tmp_path):
 
 
 def test_resumed_table_drops_rows_past_the_checkpoint(tmp_path):
-    table = CSVTable(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv", last_step=0)
     for step in (10, 20, 30):
         table.add({"step": step, "a": step})
     again = CSVTable(tmp_path / "t.csv", last_step=20)
@@ -88,7 +88,7 @@ def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):
 
 
 def test_row_that_no_longer_fits_names_the_file(tmp_path, monkeypatch):
-    table = CSVTable(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv", last_step=0)
     table.add({"step": 1})
     table.path = Path("/dev/full")
     with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
