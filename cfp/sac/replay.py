@@ -146,9 +146,10 @@ class ReplayRing(ReplayBuffer):
 
     def cut(self) -> None:
         """Let sums of rewards end with the newest transitions, as at a time limit: the environment is reset now."""
-        newest = self.pos - 1  # of an empty memory a row that is written later
-        self.timeouts[newest] += 1 - self.dones[newest]
-        self.dones[newest] = 1
+        if self.size():
+            newest = self.pos - 1
+            self.timeouts[newest] += 1 - self.dones[newest]
+            self.dones[newest] = 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch uniformly; from arrays without replacement if at least ``batch_size`` transitions are stored."""
