@@ -333,7 +333,7 @@ def write_policy(
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ConfigError(f"path must end in .safetensors, got {str(path)!r}")
-    _check_description(copy.deepcopy(description))  # which it brings up to date
+    _check_description(copy.deepcopy(description))  # it brings older ones up to date in place
     description = _translated(description, {own: word for word, own in _ENCODERS.items()})
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
