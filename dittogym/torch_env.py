@@ -548,9 +548,9 @@ def reset_options(options: Any) -> dict[str, Any]:
 
 
 def _refuse_transforms(name: str) -> None:
-    """Refuse to keep tensors that end with the transform of ``torch.func`` that they were made in."""
+    """Refuse to keep tensors that end with the transform or trace that they were made in."""
     if transforming():
         raise RuntimeError(
-            f"{name} must not be used under a transform of torch.func, whose tensors the environment would keep: use "
-            "dittogym.core.reset and dittogym.core.step with its model, which keep nothing"
+            f"{name} must not be used under a transform of torch.func or a trace of make_fx, whose tensors the "
+            "environment would keep: use dittogym.core.reset and dittogym.core.step with its model, which keep nothing"
         )

@@ -28,11 +28,11 @@ def sobol(count: int, seed: int) -> Points:
 
     Raises:
         ValueError: ``count`` or ``seed`` is not a whole number in its range.
-        RuntimeError: Under a transform of ``torch.func``, which has no such random numbers.
+        RuntimeError: Under a transform of ``torch.func`` or a trace of ``make_fx``, which have no such random numbers.
     """
     checks.whole("seed", seed, 0, 2**63 - 1)
     if transforming():
-        raise RuntimeError("sobol must not be called under a transform of torch.func: draw the points before it")
+        raise RuntimeError("sobol must not be called under a transform of torch.func or a trace: draw the points first")
     checks.whole("count", count, 1, LARGEST)
     leave_parent_threads()
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)

@@ -283,7 +283,7 @@ class Solver:
         if self._overridden:
             return f"it does not call {type(self).__name__}.{self._overridden}"
         if transforming():
-            return "the transforms of torch.func do not go through its kernels"
+            return "transforms of torch.func and traces of make_fx do not go through its kernels"
         given = [t for t in (*vars(state).values(), *fields, *self.constants.values()) if t is not None]
         if tree.has_tangents(given):
             return "it has no forward-mode derivatives"

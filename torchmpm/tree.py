@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
+from torch.fx.experimental.proxy_tensor import get_proxy_mode
 from torch.utils import _pytree as pytree
 
 Tree = TypeVar("Tree")
@@ -174,8 +175,9 @@ def has_tangents(tensors: Iterable[Tensor | None]) -> bool:
 
 
 def transforming() -> bool:
-    """Whether a transform of ``torch.func`` is active."""
-    return bool(torch._C._are_functorch_transforms_active())  # torch.func has no public query for this
+    """Whether a transform of ``torch.func`` or a trace of ``make_fx`` is active."""
+    # torch.func has no public query for this.
+    return bool(torch._C._are_functorch_transforms_active()) or get_proxy_mode() is not None
 
 
 def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

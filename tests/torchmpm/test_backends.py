@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from scenes import GRID, assert_close, assert_identical, lively, normal, robot, 
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory, tree
 from torchmpm.native import library
@@ -202,6 +204,19 @@ def test_tensors_without_numbers_take_an_eager_step(fresh_process: None, caplog:
             with pytest.raises(ValueError, match="FakeTensor"):
                 robot(5, backend="native").step(imagined)
     assert "FakeTensor" in messages(caplog)[0]
+
+
+def test_a_trace_holds_an_eager_step_and_its_gradient() -> None:
+    """It replays operators of torch alone: what the kernels write would be missing."""
+    state, drive = lively(5), normal(1, 2, 16, 16, seed=1)
+
+    def gradient(solver: Solver, drive: Tensor) -> tuple[Tensor, Tensor]:
+        x = solver.step(state, drive, substeps=2).x
+        return x, *torch.autograd.grad(x.sum(), drive)
+
+    traced = make_fx(partial(gradient, robot(5, backend="auto")))(drive.requires_grad_())
+    other = (2 * drive.detach()).requires_grad_()
+    torch.testing.assert_close(traced(other), gradient(robot(5), other), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.cuda
