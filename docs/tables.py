@@ -74,8 +74,9 @@ def evaluated(task: str, policy: str, case: str, particles: str, noise: str = ""
 
 
 def estimate(row: Row) -> str:
-    """Mean return with half its 95 % interval."""
-    return number(row["mean"]) + (f" ± {number(row['interval'])}" if row["interval"] else "")
+    """Mean return with half its 95 % interval, on one line."""
+    words = (number(row["mean"]), "±", number(row["interval"])) if row["interval"] else (number(row["mean"]),)
+    return "\N{NO-BREAK SPACE}".join(words)
 
 
 #: Policies that were preferred to others by episodes from their own start that are in the table, which flatters them.
