@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from scipy import stats
+
 import dittogym
 from baselines.compare import paper
 from cfp.robustness import COLUMNS, DISTURBANCES, KEY, MATTER, OWN_START, UNDISTURBED, ratios
@@ -208,6 +210,30 @@ def returns() -> str:
             for key in sorted(cells, key=lambda key: OBSERVES.index(key[0]))
         ),
     )
+
+
+def rewards() -> str:
+    """Coarse stages that learned from rewards alone, with full particles; the paper's coarse policy and CFP."""
+    rows = [row for row in read("returns.csv") if "`cfp-sac`" in row["algorithm"] and row["particles"] == "full"]
+    lines = []
+    for row in sorted((row for row in rows if row["std"]), key=lambda row: [*dittogym.TASKS].index(row["task"])):
+        count = int(row["episodes"])
+        interval = float(stats.t.ppf(0.975, count - 1)) * float(row["std"]) / math.sqrt(count - 1)
+        (theirs, _), (coarse, _) = paper.CURVES[row["task"]][:2]
+        lines.append(
+            [
+                name_of(row["task"]),
+                number(row["steps"]),
+                row["minutes"],
+                estimate(row | {"interval": f"{interval}"}),
+                share(row["success"]),
+                row["episodes"],
+                f"{coarse:,}",
+                f"{theirs:,}",
+            ]
+        )
+    heads = ("steps", "minutes on one core", "return, full particles", "success", "episodes")
+    return markdown(("", *heads, "paper's coarse policy", "paper's CFP"), lines)
 
 
 def published() -> str:
@@ -451,6 +477,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "published": published,
     "results": results,
     "returns": returns,
+    "rewards": rewards,
     "tasks": tasks,
     "verification": verification,
 }
