@@ -71,7 +71,7 @@ for width in (4, 2, 1, 0):
         curve.append(total)
 
 # %%
-# The return of the true reward, which counts pixels:
+# The return of the true reward:
 
 with torch.no_grad():
     _, resting = episode(torch.zeros_like(theta), 0)

@@ -8,10 +8,10 @@ gradients, and with every algorithm.
 """
 
 # %%
-# The function gets a :class:`dittogym.Transition` and returns named terms, one number for each simulation of the
-# batch. Each term is multiplied by its weight. The environment adds the terms that all tasks share, each with its
-# weight or else 0: the action cost ``action``, the penalty ``split`` for a torn robot, and ``alive``, a constant for
-# every step, which HOP leaves out.
+# The function gets a :class:`dittogym.Transition` and returns named terms, one number for each simulation of the batch.
+# Each term is multiplied by its weight. The environment adds the terms that all tasks share, with a weight of 0 if none
+# is given: the action cost ``action``, the penalty ``split`` for a torn robot, and ``alive``, a constant for every
+# step, which HOP leaves out.
 
 import dataclasses
 
@@ -75,7 +75,7 @@ for name, value in sums.items():
 #   has operations with smooth versions.
 #
 # Because ``reward_fn`` is made of torch operations, the return can be maximised by gradient ascent, a quick test of
-# whether a reward leads anywhere. Here it is with two weights of the action cost:
+# whether a reward leads anywhere. This is done here with two weights of the action cost:
 
 
 def optimise(batch: dittogym.TorchEnv, iterations: int = 8) -> tuple[torch.Tensor, list[float]]:

@@ -47,7 +47,7 @@ figure.tight_layout()
 #
 # RUN rewards speed to the right. A planner knows the simulator: it improves the next actions by gradients of the
 # reward, executes some of them, and plans again. It needs no training, whatever the body looks like. 1,000 particles
-# and a second of time are enough to see what this body can do.
+# and one second of simulated time are enough to see what this body can do.
 
 spec = dataclasses.replace(dittogym.make_spec("run", body=stool), horizon=100)
 env = dittogym.TorchEnv(spec, particles=1000)

@@ -8,7 +8,7 @@ optimised by gradient descent.
 """
 
 # %%
-# Options for single algorithms are given in a JSON file. This one limits the optimisation to 30 iterations with few
+# Options for individual algorithms are given in a JSON file. This one limits the optimisation to 30 iterations with few
 # particles.
 
 import csv

@@ -3,8 +3,8 @@ On a GPU, and on a cluster
 ==========================
 
 The same program runs on a CPU and, with ``device="cuda"``, on a GPU. A GPU needs many more robots in parallel than a
-CPU before all of it is busy. This tutorial measures the speed by the number of robots, on the machine on which the
-documentation was built. On a GPU the fused kernels need the extra ``torchmpm[cuda12]`` or ``torchmpm[cuda13]``.
+CPU before all of it is busy. This tutorial measures the speed for different numbers of robots, on the machine on which
+the documentation was built. On a GPU the fused kernels need the extra ``torchmpm[cuda12]`` or ``torchmpm[cuda13]``.
 """
 
 # %%

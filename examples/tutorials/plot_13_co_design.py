@@ -11,10 +11,10 @@ and the stiffness of the body.
 # Parameters of the body
 # ----------------------
 #
-# The particles of the disc are moved to new places by a map that keeps areas, and with them masses: the body becomes
-# longer where it becomes lower. With :math:`u` from 0 at the rear end to 1 at the front, lengths are multiplied by
-# :math:`g(u)`, and heights above the floor by :math:`1/g(u)`. Stiffness is multiplied by the exponential of a bounded
-# linear function of :math:`u` and the height.
+# The particles of the disc are moved to new places by a map that preserves areas, and with them masses: the body
+# becomes longer where it becomes lower. With :math:`u` from 0 at the rear end to 1 at the front, lengths are multiplied
+# by :math:`g(u)`, and heights above the floor by :math:`1/g(u)`. Stiffness is multiplied by the exponential of a
+# bounded linear function of :math:`u` and the height.
 
 import dataclasses
 import math
@@ -76,7 +76,7 @@ def travelled(theta: Tensor, design: Tensor) -> Tensor:
 # Optimisation
 # ------------
 #
-# One backward pass gives the derivatives with respect to both. The norm of each gradient is clipped, because
+# One backward pass gives the derivatives with respect to gait and body. The norm of each gradient is clipped, because
 # derivatives grow large where matter tears.
 
 

@@ -95,8 +95,8 @@ for update in range(UPDATES):
 # Evaluation
 # ----------
 #
-# Other commands, and initial positions that were not used in training. In training the error rises for a while: as soon
-# as the muscles are strong enough for plastic flow, the network has to learn to stop in time.
+# Evaluation uses other commands and initial positions than training. During training the error rises for a while: as
+# soon as the muscles are strong enough for plastic flow, the network has to learn to stop in time.
 
 with torch.no_grad():
     command = torch.linspace(-0.2, 0.2, ROBOTS)[:, None]
