@@ -3,7 +3,7 @@ Reading the training metrics
 ============================
 
 A run writes its metrics to ``progress.csv`` and TensorBoard. This tutorial trains a small policy and explains the
-most important ones. :doc:`/commands` lists all of them.
+most important ones. :doc:`/reference/logs` lists all of them.
 """
 
 # %%
