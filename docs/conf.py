@@ -112,7 +112,7 @@ class LinkNames(SphinxTransform):
 
 
 class KeepColons:
-    """Restores docstrings of attributes, in which Napoleon takes the words before a colon for a type."""
+    """Restores docstrings of attributes and data, in which Napoleon takes the words before a colon for a type."""
 
     def __init__(self, app: Sphinx) -> None:
         self.docstrings: dict[str, list[str]] = {}
@@ -121,12 +121,19 @@ class KeepColons:
 
     def before(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
         """Store the docstring before Napoleon processes it."""
-        if what == "attribute":
+        if what in ("attribute", "data"):
             self.docstrings[name] = lines.copy()
 
     def after(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
         """Restore it."""
         lines[:] = self.docstrings.pop(name, lines)
+
+
+def drop_protocol_signature(
+    app: Sphinx, what: str, name: str, item: object, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Drop the signature ``(*args, **kwargs)`` of protocols, of which nobody makes instances."""
+    return ("" if getattr(item, "_is_protocol", False) else signature), returns
 
 
 def accept_undocumented(app: Sphinx, env: object, node: nodes.Element, content: nodes.Node) -> nodes.Node | None:
@@ -151,6 +158,7 @@ def setup(app: Sphinx) -> None:
     """Register the extensions of this file."""
     app.connect("html-page-context", drop_links_back)
     app.connect("missing-reference", accept_undocumented)
+    app.connect("autodoc-process-signature", drop_protocol_signature)
     KeepColons(app)
     app.add_directive("command-help", CommandHelp)
     app.add_transform(LinkNames)

@@ -13,12 +13,12 @@ import dittogym
 import torchmpm
 
 PACKAGES = (torchmpm, dittogym, cfp, baselines)
-FINDER = doctest.DocTestFinder(recurse=False, exclude_empty=True)
+FINDER = doctest.DocTestFinder(exclude_empty=True)
 EXAMPLES = [
     test
     for package in PACKAGES
     for name in package.__all__
-    if callable(item := getattr(package, name))
+    if callable(item := getattr(package, name)) or inspect.ismodule(item)
     for test in FINDER.find(item, f"{package.__name__}.{name}", module=inspect.getmodule(item), globs={})
     if test.examples
 ]
