@@ -1,9 +1,9 @@
 """Batched, differentiable two-dimensional material point method in PyTorch.
 
-:class:`ParticleState` holds everything that moves. :meth:`Solver.step` takes a state and returns a new one; the solver
-is a frozen description of grid, bodies and boundary. ``substep`` is the algorithm, ``materials`` holds the
-constitutive laws, and ``native`` the same substep as fused kernels. This package imports torch, NumPy and jaxtyping,
-and NVIDIA's cuda-core for the kernels on a GPU.
+:class:`torchmpm.ParticleState` holds everything that moves. :meth:`torchmpm.Solver.step` takes a state and returns a
+new one; the solver is a frozen description of grid, bodies and boundary. ``torchmpm.substep`` is the algorithm,
+``torchmpm.materials`` holds the constitutive laws, and ``torchmpm.native`` the same substep as fused kernels. This
+package imports torch, NumPy and jaxtyping, and NVIDIA's cuda-core for the kernels on a GPU.
 """
 
 from torchmpm import diagnostics, sampling, tree

@@ -1,7 +1,8 @@
-"""What is in the window, and balances of a simulation: mass, momentum and energy.
+"""Which particles are simulated, and mass, momentum and energy of each simulation.
 
-All functions raise a TypeError for anything but a solver and a state, and a ValueError for a state with another number
-of particles than the solver's bodies.
+Sums run over all N particles of a simulation, also those outside the window. All functions raise a TypeError if
+``solver`` is not a :class:`torchmpm.Solver` or ``state`` not a :class:`torchmpm.ParticleState`, and a ValueError if the
+state has another number of particles than the solver's bodies, or the solver's gravity another B than the state.
 """
 
 import torch
@@ -16,30 +17,47 @@ from torchmpm.substep import free_velocity, grid_velocity, particles_to_grid
 
 
 def inside(solver: Solver, state: ParticleState, origin: Tensor | None = None) -> Tensor:
-    """Which particles are in the window, whose lower left corner is at ``origin`` (B, 2), m, and move; (B, N) bool."""
+    """Return which particles lie in the window and are simulated.
+
+    Args:
+        solver: The solver.
+        state: The state.
+        origin: (B, 2) lower left corner of the window in the world, m; ``None`` stands for (0, 0).
+
+    Returns:
+        (B, N) bool.
+
+    Raises:
+        ValueError: ``origin`` has another shape, dtype or device than goes with the state.
+        TypeError: ``origin`` is not a tensor.
+    """
     checks.instance("solver", solver, Solver)
     at = solver.check_arguments(state, None, origin)
     return solver.grid.takes_part(state.x[..., 0], state.x[..., 1], at)
 
 
 def masses(solver: Solver, state: ParticleState) -> Tensor:
-    """Mass of every particle, (B, N), kg."""
+    """Return the mass of every particle, (B, N), kg."""
     _check(solver, state)
     return per_particle(solver.bodies, "mass", state.Jp) * torch.ones_like(state.Jp)
 
 
 def mass(solver: Solver, state: ParticleState) -> Tensor:
-    """Total mass, (B,), kg."""
+    """Return the total mass of each simulation, (B,), kg."""
     return masses(solver, state).sum(-1)
 
 
 def momentum(solver: Solver, state: ParticleState) -> Tensor:
-    """Linear momentum, (B, 2), kg m/s."""
+    """Return the linear momentum, the sum of ``m v`` over the particles, (B, 2), kg m/s."""
     return (masses(solver, state)[..., None] * state.v).sum(1)
 
 
 def angular_momentum(solver: Solver, state: ParticleState) -> Tensor:
-    """Angular momentum about the world's origin, (B,), kg m^2/s, with the spin in the affine matrices (h^2/4 each)."""
+    """Return the angular momentum about the world's origin, (B,), kg m^2/s, positive counterclockwise.
+
+    It is the sum of ``m (x v_y - y v_x + h^2/4 (C_yx - C_xy))`` over the particles: APIC keeps a spin in the affine
+    matrices, in which h^2/4 is the moment of quadratic B-splines (Jiang et al., 2015).
+    """
     mass = masses(solver, state)
     orbit = state.x[..., 0] * state.v[..., 1] - state.x[..., 1] * state.v[..., 0]
     spin = 0.25 * solver.grid.h**2 * (state.C[..., 1, 0] - state.C[..., 0, 1])
@@ -47,12 +65,16 @@ def angular_momentum(solver: Solver, state: ParticleState) -> Tensor:
 
 
 def kinetic_energy(solver: Solver, state: ParticleState) -> Tensor:
-    """Energy of motion of the particles, without the affine part, (B,), J."""
+    """Return the kinetic energy, the sum of ``m |v|^2 / 2`` over the particles, (B,), J; C does not count."""
     return 0.5 * (masses(solver, state) * state.v.square().sum(-1)).sum(-1)
 
 
 def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
-    """Energy stored in deformation, (B,), J; muscles are not counted."""
+    """Return the energy stored in elastic deformation, (B,), J.
+
+    It is the sum of :meth:`torchmpm.Material.energy` times the undeformed volume over the particles; muscles do not
+    count.
+    """
     _check(solver, state)
     total = torch.zeros_like(state.Jp[:, 0])
     for body, part in slices(solver.bodies):
@@ -62,7 +84,7 @@ def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 
 def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
-    """Energy of position under gravity relative to the world's origin, (B,), J."""
+    """Return the potential energy under gravity g, the sum of ``-m g . x`` over the particles, (B,), J."""
     mass = masses(solver, state)
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype, device=state.device).reshape(-1, 1, 2)
     return -(mass * (state.x * gravity).sum(-1)).sum(-1)
@@ -71,18 +93,22 @@ def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
 def impulses(
     solver: Solver, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Momentum that each external influence adds in the substep that starts at ``state``.
+    """Return the momentum that each external influence adds in one substep.
 
     Args:
         solver: The solver.
-        state: Where the substep starts.
-        actuation: (B, 2, G, G), Pa, as in :meth:`torchmpm.Solver.step`.
-        origin: (B, 2), m, as in :meth:`torchmpm.Solver.step`.
+        state: The state at the start of the substep.
+        actuation: (B, 2, G, G) muscle stress, Pa, as in :meth:`torchmpm.Solver.step`.
+        origin: (B, 2) lower left corner of the window, m, as in :meth:`torchmpm.Solver.step`.
 
     Returns:
-        ``"gravity"``, ``"damping"`` and ``"boundary"``, each (B, 2), kg m/s. Their sum is the change of
-        :func:`momentum` over the substep while all particles are more than a cell from the ends of the window, but for
-        the 1e-10 kg that are added to the mass of a node. Internal forces and muscles cancel.
+        Momenta ``"gravity"``, ``"damping"`` and ``"boundary"``, (B, 2) each, kg m/s. While all particles are more than
+        a cell away from the ends of the window, their sum is the change of :func:`momentum` over the substep, except
+        for the effect of the 1e-10 kg that are added to the mass of each node. Internal forces and muscles cancel out.
+
+    Raises:
+        ValueError: ``actuation`` or ``origin`` has another shape, dtype or device than goes with the state.
+        TypeError: ``actuation`` or ``origin`` is not a tensor.
     """
     checks.instance("solver", solver, Solver)
     scene = solver.scene(state, actuation, solver.check_arguments(state, actuation, origin))

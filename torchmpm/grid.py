@@ -18,20 +18,20 @@ LARGEST = 2**15
 @tree.register
 @dataclass(frozen=True)
 class Grid:
-    """Square window of ``resolution`` x ``resolution`` nodes, node (i, j) at ``origin + (i, j) * spacing``.
+    """A square window of G x G nodes, of which node (i, j) lies at ``origin + (i * h, j * h)``.
 
-    Where the window lies in the world (its ``origin``) is an argument of each step, because it moves.
+    Where the window lies in the world, its ``origin``, is an argument of each step, because a window may move.
 
     Attributes:
-        resolution: Nodes per axis.
-        spacing: Distance h between nodes in m; ``None`` means ``1 / resolution`` (a window of one metre).
-        margin: Particles closer than this to the left or right end of the window (m) take no part. Where no wall keeps
-            them from the left end, half a cell is safer: there, weights can be negative, and with them the mass of a
-            node, which would throw particles around.
+        resolution: G, the number of nodes along each axis.
+        spacing: Distance h between nodes, m; ``None`` stands for ``1 / resolution``, a window 1 m wide.
+        margin: Particles closer than this to the left or right end of the window, m, are not simulated. If no wall
+            keeps particles away from the left end, choose ``h / 2``: within that distance of the end interpolation
+            weights, and with them the masses of nodes, can become negative, which throws particles around.
 
     Raises:
-        ValueError: ``resolution`` is not a whole number from 4 to 32,768, ``spacing`` is not positive, or ``margin``
-            does not leave any of the window.
+        ValueError: ``resolution`` is not a whole number from 4 to 32,768, ``spacing`` is not a positive number, or
+            ``margin`` is negative or not below half the window's width.
     """
 
     resolution: int = 128
@@ -62,7 +62,15 @@ class Grid:
         return self.resolution * self.h - self.margin
 
     def nodes(self, origin: Tensor) -> Tensor:
-        """Where the nodes of a window at ``origin`` (B, 2), m, are, with those of the padding, (2, B, cells), m."""
+        """Return the positions of all nodes, including the three rows of padding on each side of the window.
+
+        Args:
+            origin: (B, 2) lower left corner of the window in the world, m.
+
+        Returns:
+            (2, B, cells) x and y of the nodes, m, with ``cells = (resolution + 6)**2``; the index along y runs fastest.
+            :meth:`torchmpm.Solver.boundary` gets velocities in this order.
+        """
         along = torch.arange(-PAD, self.resolution + PAD).to(origin) * self.h
         x, y = torch.meshgrid(along, along, indexing="ij")
         return torch.stack((x.flatten(), y.flatten()))[:, None] + origin.T[..., None]

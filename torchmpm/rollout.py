@@ -23,24 +23,37 @@ SEGMENT = 10
 def repeated(
     step: Callable[..., State], state: State, times: int, *, segment: Segment = None, shared: Any = None
 ) -> State:
-    """Apply ``step`` to ``state`` again and again.
+    """Apply a function to a state several times, with checkpoints that bound the memory of gradients.
 
     Args:
-        step: ``step(state) -> state``, or ``step(shared, state) -> state``; must not depend on a random generator.
-        state: A tensor or a tree of tensors (see ``torchmpm.tree``).
+        step: ``step(state) -> state``, or, if ``shared`` is given, ``step(shared, state) -> state``. It must not depend
+            on a random generator.
+        state: A tensor or a tree of tensors (see :mod:`torchmpm.tree`).
         times: Number of repetitions.
         segment: With gradients enabled, keep the state only every ``segment`` steps and replay the steps between in
-            the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
-            forward pass. ``None``, and any value under ``torch.func``, keeps the whole graph; ``"auto"`` is 10.
-        shared: A tree of all tensors that ``step`` reads besides the state. Without it ``step`` may read any tensors,
-            and checkpoints take about twice as long, or many times as long, and more memory than none, if it calls
-            ``torch.autograd.grad``.
+            the backward pass. This takes memory for ``times / segment`` states and the graph of ``segment`` steps, and
+            the time of one more forward pass. ``None`` keeps the whole graph, as does any value under ``torch.func``
+            and ``torch.compile``; ``"auto"`` is 10.
+        shared: A tree of all tensors that ``step`` reads besides the state. Without it, ``step`` may read any tensors,
+            but checkpoints take about twice as long; and if ``step`` calls ``torch.autograd.grad``, they take many
+            times as long, and more memory than a whole graph.
+
+    Returns:
+        The state after ``times`` steps.
 
     Raises:
-        ValueError: ``times`` is negative or ``segment`` is below 1.
-        TypeError: ``shared``, or the state beside it, holds something whose tensors checkpoints cannot see, such as a
-            module.
+        ValueError: ``times`` is not a whole number from 0, or ``segment`` not a whole number from 1, ``None`` or
+            ``"auto"``.
+        TypeError: With ``shared`` and checkpoints: ``shared`` or ``state`` holds something whose tensors checkpoints
+            cannot see, such as a module.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
+
+    Examples:
+        >>> import torch, torchmpm
+        >>> x = torch.ones(3, requires_grad=True)
+        >>> torchmpm.repeated(torch.sin, x, times=100, segment=10).sum().backward()
+        >>> x.grad.shape
+        torch.Size([3])
     """
     times, segment = checks.whole("times", times, 0), checks.segment(segment)
     if segment is None or not _records():
@@ -72,15 +85,16 @@ def trajectory(
     observe: Callable[[State], Output],
     checkpointed: bool = True,
 ) -> tuple[State, list[Output]]:
-    """Advance ``state`` once per input and collect an output after each step.
+    """Advance a state once per input and collect an output after each step.
 
     Args:
         step: ``step(state, input) -> state``, for example ``lambda s, a: solver.step(s, a, substeps=100)``.
-        state: The start.
-        inputs: One entry a step, for example actuation fields.
+        state: The state at the start, a tensor or a tree of tensors (see :mod:`torchmpm.tree`).
+        inputs: One entry a step, for example actuation fields (B, 2, G, G).
         observe: What to keep of each state, for example ``lambda s: s.x.mean(1)``.
         checkpointed: With gradients enabled, keep only the states between steps and replay each step in the backward
-            pass. Nests with the ``segment`` of :meth:`torchmpm.Solver.step`, and does nothing under ``torch.func``.
+            pass. This combines with the ``segment`` of :meth:`torchmpm.Solver.step`, and has no effect under
+            ``torch.func`` and ``torch.compile``.
 
     Returns:
         The final state and the list of outputs, one per input.
@@ -88,6 +102,18 @@ def trajectory(
     Raises:
         ValueError: ``checkpointed`` is not True or False.
         RuntimeError: In the backward pass: a tensor that ``step`` reads was changed in place before its replay.
+
+    Examples:
+        >>> import torch, torchmpm
+        >>> body = torchmpm.Body(200, torchmpm.Elastic(1e3, 1e3), mass=1e-2, volume=1e-4, muscle=True)
+        >>> solver = torchmpm.Solver(torchmpm.Grid(32), (body,))
+        >>> disc = torchmpm.sampling.disc(torchmpm.sampling.sobol(200, seed=0), centre=(0.5, 0.5), radius=0.08)
+        >>> start = torchmpm.ParticleState.at_rest(torch.as_tensor(disc))
+        >>> fields = torch.zeros(4, 1, 2, 32, 32, dtype=torch.float64, requires_grad=True)  # of four steps
+        >>> advance = lambda state, field: solver.step(state, field, substeps=10)
+        >>> end, centres = torchmpm.trajectory(advance, start, fields, observe=lambda state: state.x.mean(1))
+        >>> len(centres), centres[0].shape
+        (4, torch.Size([1, 2]))
     """
     checks.flag("checkpointed", checkpointed)
     outputs = []

@@ -1,7 +1,9 @@
 """Particle positions in simple shapes, from numbers that the caller supplies.
 
-Each shape is a map of the unit square: give it ``generator.random((count, 2))`` of NumPy for random particles,
-``sobol(count, seed)`` for evenly spread ones. No function here touches a global generator.
+Each shape is a map of the unit square: its ``numbers`` are ``generator.random((count, 2))`` of a NumPy generator for
+random particles, or ``sobol(count, seed)`` for evenly spread ones. No function here reads or changes a global
+generator. Positions are NumPy arrays of float64; ``torch.as_tensor`` makes a tensor of them, for
+:meth:`torchmpm.ParticleState.at_rest`.
 """
 
 import math
@@ -20,15 +22,27 @@ LARGEST = 2**30
 
 
 def sobol(count: int, seed: int) -> Points:
-    """Points (N, 2) of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
+    """Return evenly spread points of the unit square, with far fewer clumps and holes than random ones.
+
+    They are the first points of a scrambled Sobol sequence (Sobol, 1967; Owen, 1998), see
+    ``torch.quasirandom.SobolEngine``.
 
     Args:
         count: N, from 1 to 2**30.
         seed: Seed of the scrambling, a whole number from 0 to 2**63 - 1.
 
+    Returns:
+        (N, 2) numbers from 0 to 1.
+
     Raises:
         ValueError: ``count`` or ``seed`` is not a whole number in its range.
         RuntimeError: Under a transform of ``torch.func`` or a trace of ``make_fx``, which have no such random numbers.
+
+    Examples:
+        >>> import torch, torchmpm
+        >>> numbers = torchmpm.sampling.sobol(1000, seed=0)
+        >>> points = torchmpm.sampling.disc(numbers, centre=(0.5, 0.5), radius=0.1)
+        >>> state = torchmpm.ParticleState.at_rest(torch.as_tensor(points, dtype=torch.float32))
     """
     checks.whole("seed", seed, 0, 2**63 - 1)
     if transforming():
@@ -42,12 +56,15 @@ def sobol(count: int, seed: int) -> Points:
 
 
 def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """Positions (N, 2), m, in a filled axis-aligned box.
+    """Return positions in a filled axis-aligned box, of uniform density.
 
     Args:
-        numbers: (N, 2) points of the unit square.
-        corner: Lower left corner, m.
+        numbers: (N, 2) numbers from 0 to 1, one row for each particle.
+        corner: Lower left corner (x, y), m.
         size: Width and height, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: ``numbers`` is not such an array, ``corner`` not two numbers, or ``size`` not two positive numbers.
@@ -59,12 +76,15 @@ def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float])
 
 
 def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
-    """Positions (N, 2), m, in a filled disc of uniform density.
+    """Return positions in a filled disc of uniform density.
 
     Args:
-        numbers: (N, 2) points of the unit square.
-        centre: Centre, m.
+        numbers: (N, 2) numbers from 0 to 1, one row for each particle.
+        centre: Centre (x, y), m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: ``numbers`` is not such an array, ``centre`` not two numbers, or ``radius`` not positive.
@@ -75,14 +95,18 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
 
 
 def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
-    """Positions (N, 2), m, uniform over the width of a disc and, at each x, over the chord: denser to left and right.
+    """Return positions in a disc that are denser to the left and to the right, as in DittoGym's round robots.
 
-    The distribution of DittoGym's round robots; with constant particle mass it also makes them stiffer at both ends.
+    They are uniform in x over the width of the disc and, at each x, in y over the chord (Huang et al., 2024). With
+    equal particle masses this also makes robots stiffer at both ends.
 
     Args:
-        numbers: (N, 2) points of the unit square.
-        centre: Centre, m.
+        numbers: (N, 2) numbers from 0 to 1, one row for each particle.
+        centre: Centre (x, y), m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: ``numbers`` is not such an array, ``centre`` not two numbers, or ``radius`` not positive.
@@ -100,12 +124,15 @@ def _check_round(numbers: Points, centre: tuple[float, float], radius: float) ->
 
 
 def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """Positions (N, 2), m, in the middle of the N cells of a box; rows from the bottom up.
+    """Return the centres of the cells of a box, row by row from the bottom up.
 
     Args:
-        cells: Number of cells in x and y, N at most 2**30.
-        corner: Lower left corner, m.
-        size: Width and height, m.
+        cells: Number of cells in x and in y; their product N is at most 2**30.
+        corner: Lower left corner (x, y) of the box, m.
+        size: Width and height of the box, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: ``cells`` is not two whole numbers above 0 or too many, ``corner`` not two numbers, or ``size`` not
@@ -120,19 +147,23 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
 
 
 def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """Positions (N, 2), m, that fill the pixels of a mask with uniform density.
+    """Return positions that fill the pixels of a mask with uniform density.
 
-    The first number chooses the column by its share of the pixels and the place within it, the second the place in the
-    column's pixels, so that evenly spread numbers give evenly spread particles.
+    The first of a particle's two numbers determines its x: the column of pixels, chosen in proportion to their number,
+    and the place within the column's width. The second number determines its y among the pixels of that column. So
+    evenly spread numbers give evenly spread particles.
 
     Args:
-        numbers: (N, 2) points of the unit square.
-        mask: (H, W), row 0 at the top.
-        corner: Lower left corner of the whole image, m.
+        numbers: (N, 2) numbers from 0 to 1, one row for each particle.
+        mask: (H, W) bool or whole numbers, true or not zero where particles go; row 0 is at the top.
+        corner: Lower left corner (x, y) of the whole image, m.
         size: Width and height of the whole image, m.
 
+    Returns:
+        (N, 2) positions, m.
+
     Raises:
-        ValueError: The mask has no pixel set or another shape, or another argument is not as in :func:`box`.
+        ValueError: ``mask`` has no pixel set or is another kind of array, or another argument is not as in :func:`box`.
     """
     checks.points("numbers", numbers)
     if not isinstance(mask, np.ndarray) or mask.ndim != 2 or mask.dtype.kind not in "biu":

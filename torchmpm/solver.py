@@ -33,25 +33,32 @@ from torchmpm.tree import transforming
 class Solver:
     """Explicit MLS-MPM with APIC transfers and quadratic B-splines on a window of nodes.
 
-    A description without state: wherever a material value, a mass or gravity is a tensor, results are differentiable
-    in it, and a tensor of shape (B,) gives each simulation of the batch its own value.
+    The moving least squares material point method is that of Hu et al. ("A moving least squares material point method
+    with displacement discontinuity and two-way rigid body coupling", 2018), the transfers between particles and nodes
+    are those of Jiang et al. ("The affine particle-in-cell method", 2015).
+
+    A solver is a description without state. Wherever a material constant, a mass, a volume or gravity is a tensor,
+    results are differentiable with respect to it, and a tensor of shape (B,) gives each simulation of the batch its own
+    value. A subclass, a frozen dataclass itself, may override :meth:`scene` and :meth:`boundary`.
 
     Attributes:
         grid: The window of nodes.
-        bodies: The particles in their order; their counts add up to N.
+        bodies: The bodies in the order of their particles; their counts add up to N.
         gravity: Acceleration (x, y), m/s^2: two numbers, or a tensor of shape (2,) or (B, 2).
-        damping: Factor on every node velocity in every substep (1 = none).
-        rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
+        damping: Factor on the velocities of all nodes in every substep, from 0 to 1; 1 is no damping.
+        rules: Velocity rules, in order of precedence, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, CUDA C++ on a GPU), ``"eager"``
-            (operator by operator), or ``"auto"``: native where it works, else eager.
+        backend: ``"native"`` for fused kernels, C++ on a CPU and CUDA C++ on a GPU; ``"eager"`` for PyTorch operations,
+            which take any material, transforms of ``torch.func`` and second derivatives; ``"auto"`` for native where it
+            works and eager elsewhere, with the reason logged once.
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`, and gravity with which a particle at rest crosses a
             cell of the grid within a substep.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` not from 0 to 1, gravity not
-            two numbers or of another shape, a tensor that is not finite, or an unknown or unavailable backend.
-        TypeError: ``grid``, a body or a rule has another type.
+        ValueError: There are no bodies, ``dt`` is not positive, or above :meth:`stable_dt`, or too long for gravity,
+            ``damping`` is not from 0 to 1, ``gravity`` is not two finite numbers or has another shape, a tensor is not
+            finite, a mass or volume is not positive, or ``backend`` is unknown or not available.
+        TypeError: ``grid``, a body or a rule has another type, or a tensor is not dense.
 
     Examples:
         A drop of gel falls for 10 ms. The gradient of its position with respect to its initial velocity is that time.
@@ -134,14 +141,17 @@ class Solver:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
-        """The same solver with other constants, for those that change in every step.
+        """Return the same solver with other constants, quickly enough for constants that change in every step.
 
-        The checks of the solver's constructor are skipped, that of the largest stable ``dt`` too; those of bodies and
-        materials were made when they were built, and :meth:`step` checks the shapes that it reads.
+        The checks of the constructor are skipped, that of the largest stable ``dt`` too. Bodies and materials check
+        their values when they are made, and :meth:`step` checks the shapes that it reads.
 
         Args:
-            bodies: Bodies of the same counts.
-            gravity: Acceleration, two numbers or a tensor of shape (2,) or (B, 2), m/s^2.
+            bodies: Bodies with the counts of the present ones.
+            gravity: Acceleration (x, y), m/s^2: two numbers, or a tensor of shape (2,) or (B, 2).
+
+        Returns:
+            A solver of the same class, with the same values of all other fields.
         """
         solver = object.__new__(type(self))
         for name, value in (self.__getstate__() | {"bodies": bodies, "gravity": gravity}).items():
@@ -165,15 +175,21 @@ class Solver:
         return sum(body.count for body in self.bodies)
 
     def stable_dt(self, actuation: Value = 0.0) -> float:
-        """Largest duration of a substep for which small strains of undeformed material do not grow, s.
+        """Return the largest duration of a substep for which small strains of undeformed material do not grow, s.
 
-        Large strains, and snow that has hardened, are stiffer and may need less. See ``torchmpm.stability``.
+        It is the least of ``h / sqrt((k + 2 |a|) V / m)`` over all particles, with the stiffness k of the material, the
+        actuation a (0 without muscles), the volume V and the mass m. This holds for any arrangement of particles, as
+        the velocity gradient C of a particle cannot exceed what the kinetic energy of its nodes allows,
+        ``h^2/4 |C|^2 <= sum w |v|^2``. Large strains, and snow that has hardened, are stiffer and may need less.
 
         Args:
-            actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
+            actuation: Largest actuation of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
+
+        Returns:
+            Seconds; infinity if nothing is stiff.
 
         Raises:
-            ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
+            ValueError: The shapes of a body's values do not go together, or values are not finite or have a wrong sign.
         """
         return stability.stable_dt(self.bodies, self.grid.h, actuation)
 
@@ -188,31 +204,34 @@ class Solver:
     ) -> ParticleState:
         """Advance all simulations by ``substeps * dt`` seconds.
 
-        Particles outside the window keep their whole state until it comes back to them, and contribute to no
-        derivative; so do those whose position is not finite. A velocity or deformation of a particle in the window
-        that is not finite spreads through the grid in its simulation. It can make the derivative in a constant that
-        simulations share NaN, also that of a loss on other simulations alone.
+        Particles outside the window, and particles whose position is not finite, keep their whole state and contribute
+        to no derivative; a particle outside moves on once the window reaches it again. A velocity or deformation in the
+        window that is not finite spreads through the grid of its simulation. It can also make the derivative with
+        respect to a constant that simulations share NaN, even if the loss depends on other simulations alone.
 
         Args:
-            state: The current state.
-            actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
-                indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None``: no actuation. It
-                makes matter stiffer: ``dt`` must not exceed ``stable_dt`` of its largest magnitude.
-            substeps: Number of substeps.
-            origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0). An element whose origin
-                is not finite, or far from its matter, does not move and harms no other.
+            state: The present state of B simulations with the solver's N particles.
+            actuation: (B, 2, G, G) muscle stress on the nodes of the window, Pa, for bodies with ``muscle=True``; a
+                positive value contracts. ``[:, 0]`` acts along material x and ``[:, 1]`` along material y; the last two
+                indices are (i, j), to the right and upwards. ``None`` means no actuation. Actuation makes matter
+                stiffer: ``dt`` must not exceed :meth:`stable_dt` of its largest magnitude, which is not checked.
+            substeps: Number of substeps, at least 0.
+            origin: (B, 2) lower left corner of the window in the world, m; ``None`` stands for (0, 0). A simulation
+                whose origin is not finite, or far from its matter, stands still and does not affect the others.
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`. The native
-                backend keeps the start of a segment and replays its substeps onto a tape; ``"auto"`` and ``None`` make
-                its segments as long as a tape may be.
+                backend keeps the state at the start of each segment and replays the segment in the backward pass; for
+                it ``"auto"`` and ``None`` stand for the longest segments that memory for the replay allows.
 
         Returns:
-            The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
+            The new state, differentiable with respect to state, actuation, origin, material constants, masses, volumes
+            and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
-                this.
-            TypeError: The state, the actuation or the origin has another type.
-            RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
+            ValueError: Shapes, dtypes or devices do not fit together, ``substeps`` or ``segment`` is out of range, or
+                the native backend was chosen and cannot run this.
+            TypeError: ``state``, ``actuation`` or ``origin`` has another type, or a material returns tensors of another
+                number, shape or dtype.
+            RuntimeError: In the backward pass: one of these tensors was changed in place after the step.
         """
         if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
             raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
@@ -233,10 +252,16 @@ class Solver:
         return ParticleState.from_stack(torch.stack(end))
 
     def boundary(self, scene: Scene, velocity: Tensor) -> Tensor:
-        """What the surroundings do to the velocities (2, B, cells) of the nodes, m/s, in a substep.
+        """Change the velocities of the nodes as the surroundings do in a substep: apply the velocity rules.
 
-        Here the velocity rules. A subclass may add surfaces of other shapes, or ones that move; it runs on the eager
-        backend. :meth:`torchmpm.Grid.nodes` says where the nodes are.
+        A subclass may add surfaces of other shapes, or surfaces that move; it then runs on the eager backend.
+
+        Args:
+            scene: What the substeps of this step share, see :meth:`scene`.
+            velocity: (2, B, cells) velocities of the nodes, m/s, in the order of :meth:`torchmpm.Grid.nodes`.
+
+        Returns:
+            The new velocities (2, B, cells), m/s.
         """
         return constrain(scene.faces, velocity)
 
@@ -293,9 +318,15 @@ class Solver:
         return self.kernels.unsupported(state.device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None, origin: Tensor) -> Scene:
-        """What the substeps of a step share: ``state``, ``actuation`` and ``origin`` of :meth:`step`, checked.
+        """Prepare what all substeps of a step share; only the eager backend calls this.
 
-        A subclass may change it, for example the friction of ``faces``. It runs on the eager backend.
+        A subclass may return a changed scene, for example with another friction of its ``faces``; it then runs on the
+        eager backend.
+
+        Args:
+            state: The state at the start of the step.
+            actuation: (B, 2, G, G) muscle stress, Pa, or ``None``, as in :meth:`step`.
+            origin: (B, 2) lower left corner of the window in the world, m.
         """
         nodes = self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]

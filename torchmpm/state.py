@@ -24,16 +24,19 @@ _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
 class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
 
+    Particles lie in the order of the solver's bodies. ``state[index]`` selects simulations of the batch.
+
     The solver stores each component of a vector or matrix contiguously behind these shapes (strides, not copies),
-    because its arithmetic runs over whole components. A field of a result therefore holds the memory of all: keep
-    or save ``state.x.clone()`` where that is all you need of many states.
+    because its arithmetic runs over whole components. A field of a result is therefore a view that keeps the memory of
+    all fields alive: to store only the positions of many states, store ``state.x.clone()``.
 
     Attributes:
-        x: (B, N, 2) positions in the world, m.
+        x: (B, N, 2) positions (x, y) in the world, m.
         v: (B, N, 2) velocities, m/s.
-        C: (B, N, 2, 2) affine velocity matrix of APIC, row = velocity component, 1/s.
+        C: (B, N, 2, 2) affine velocity matrix of APIC (Jiang et al., 2015), 1/s; ``C[..., i, j]`` approximates the
+            derivative of velocity component i along axis j.
         F: (B, N, 2, 2) elastic part of the deformation gradient, dimensionless.
-        Jp: (B, N) plastic volume ratio, dimensionless; only snow changes it.
+        Jp: (B, N) plastic volume ratio, dimensionless, 1 at rest; only :class:`torchmpm.Snow` changes it.
 
     Raises:
         ValueError: A field has the wrong shape, is neither float32 nor float64, or dtype or device differ between
@@ -79,14 +82,17 @@ class ParticleState:
 
     @classmethod
     def at_rest(cls, x: Float[Tensor, "*B N 2"]) -> ParticleState:
-        """Undeformed particles without velocity: v = C = 0, F = I, Jp = 1.
+        """Return undeformed particles without velocity: v = C = 0, F = I and Jp = 1.
 
         Args:
-            x: (B, N, 2) or (N, 2) positions in m; the latter becomes a batch of one.
+            x: (B, N, 2) or (N, 2) positions in the world, m; (N, 2) becomes a batch of one.
+
+        Returns:
+            A state whose fields have the dtype and device of ``x``.
 
         Raises:
-            ValueError: They have another shape, or are neither float32 nor float64.
-            TypeError: They are not a dense tensor.
+            ValueError: ``x`` has another shape, or is neither float32 nor float64.
+            TypeError: ``x`` is not a dense tensor.
         """
         leave_parent_threads()
         checks.tensor("x", x)
@@ -118,7 +124,14 @@ class ParticleState:
         return self.x.device
 
     def to(self, *args: Any, **kwargs: Any) -> ParticleState:
-        """Copy to another dtype or device; ``args`` and ``kwargs`` are those of :meth:`torch.Tensor.to`.
+        """Convert all fields to another dtype or device, as :meth:`torch.Tensor.to` does.
+
+        Args:
+            args: Positional arguments of :meth:`torch.Tensor.to`, such as a dtype or a device.
+            kwargs: Keyword arguments of :meth:`torch.Tensor.to`.
+
+        Returns:
+            A new state, whose fields are the same tensors where nothing had to be converted.
 
         Raises:
             ValueError: The dtype is neither float32 nor float64.
@@ -127,11 +140,11 @@ class ParticleState:
         return replace(moved)
 
     def detach(self) -> ParticleState:
-        """The same numbers, cut off from the autograd graph."""
+        """Return a state with the same numbers that is detached from the autograd graph."""
         return tree.detach(self)
 
     def clone(self) -> ParticleState:
-        """An independent copy, for branching a simulation."""
+        """Return a copy with memory of its own; gradients flow through it, as through :meth:`torch.Tensor.clone`."""
         return tree.map(Tensor.clone, self)
 
     def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
@@ -142,7 +155,13 @@ class ParticleState:
         return ParticleState, tuple(t.detach().clone().requires_grad_(t.requires_grad) for t in own)
 
     def __getitem__(self, index: Any) -> ParticleState:
-        """Select batch elements by a number, slice, list or tensor; a number keeps a batch dimension of one.
+        """Select simulations of the batch.
+
+        Args:
+            index: A number, which keeps a batch of one, or a slice, a list or a tensor of numbers or bools.
+
+        Returns:
+            A state of the selected simulations, indexed as torch indexes the first dimension of each field.
 
         Raises:
             IndexError: There is no such batch element, or the index has several dimensions or is a tuple, string or
@@ -162,16 +181,23 @@ class ParticleState:
         return tree.map(lambda t: t[index], self)
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
-        """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
+        """Choose for each simulation between this state and another one.
+
+        Args:
+            mask: (B,) bool, true for the simulations that are taken from this state.
+            other: The state of the others, with the same B, N and dtype.
+
+        Returns:
+            A new state; gradients flow into the chosen simulations of both.
 
         Raises:
-            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has other sizes or another dtype.
+            ValueError: ``mask`` is not bool of shape (B,), or ``other`` has another B, N or dtype.
             TypeError: ``mask`` is not a tensor.
         """
         return tree.where(mask, self, other)
 
     def is_finite(self) -> Bool[Tensor, " B"]:
-        """Which simulations hold finite numbers only, (B,)."""
+        """Return which simulations hold finite numbers only, (B,) bool."""
         # Zero times a finite number is zero and zero times anything else is NaN, which the sum keeps.
         return (self.stack().detach() * 0.0).sum((0, 2)) == 0.0
 

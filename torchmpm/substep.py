@@ -29,18 +29,34 @@ Components = tuple[Tensor, ...]
 @tree.register
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same during one step, in the form that a substep needs."""
+    """What stays the same during one step, in the form that a substep needs; see :meth:`torchmpm.Solver.scene`.
+
+    Values on nodes are in the order of :meth:`torchmpm.Grid.nodes`, with a leading 1 instead of B where they are the
+    same in all simulations.
+
+    Attributes:
+        grid: The grid of the solver.
+        bodies: Its bodies.
+        dt: Duration of a substep, s.
+        origin: (B, 2) lower left corner of the window in the world, m.
+        mass: (1 or B, N) masses of the particles, kg.
+        exists: (1, cells) 1 on the nodes of the window, 0 on the padding.
+        gravity: (2, 1 or B, cells) velocity that the nodes gain by gravity in a substep, m/s.
+        damping: Factor on the velocities of the nodes in a substep.
+        faces: The velocity rules as masks over the nodes, by direction.
+        actuation: (2, B, cells) muscle stress on the nodes, Pa; ``None`` without actuation.
+    """
 
     grid: Grid
     bodies: tuple[Body, ...]
-    dt: float  # s
-    origin: Tensor  # (B, 2) lower left corner of the window, m
-    mass: Tensor  # (B or 1, N) kg
-    exists: Tensor  # (1, cells) 1 on nodes that exist, 0 on the padding
-    gravity: Tensor  # (2, B or 1, cells) velocity gained by gravity in a substep, m/s
-    damping: float  # factor on node velocities in a substep
-    faces: tuple[Face, ...]  # velocity rules as masks
-    actuation: Tensor | None  # (2, B, cells) on the nodes, Pa
+    dt: float
+    origin: Tensor
+    mass: Tensor
+    exists: Tensor
+    gravity: Tensor
+    damping: float
+    faces: tuple[Face, ...]
+    actuation: Tensor | None
 
 
 class Scattered(NamedTuple):
@@ -54,9 +70,18 @@ class Scattered(NamedTuple):
 
 
 def substep(scene: Scene, state: Components, boundary: Callable[[Scene, Tensor], Tensor]) -> Components:
-    """Advance all particles by one substep: from components (B, N) to components (B, N).
+    """Advance all particles by one substep of MLS-MPM (Hu et al., 2018) with APIC transfers (Jiang et al., 2015).
 
-    ``boundary`` is what the surroundings do to the velocities of the nodes, see :meth:`torchmpm.Solver.boundary`.
+    This is the substep of the eager backend: deform the particles, evaluate their stress, collect mass and momentum on
+    the nodes, apply gravity, damping and the boundary there, and interpolate velocities back to the particles.
+
+    Args:
+        scene: What the substeps share, see :meth:`torchmpm.Solver.scene`.
+        state: The 13 components of a :class:`torchmpm.ParticleState`, (B, N) each: x, v, C and F, row by row, and Jp.
+        boundary: What the surroundings do to the velocities of the nodes, see :meth:`torchmpm.Solver.boundary`.
+
+    Returns:
+        The 13 components after the substep, (B, N) each.
     """
     state = _detach_unresolved(scene, state)
     scattered = particles_to_grid(scene, state)

@@ -1,8 +1,9 @@
-"""States as pytrees: nested containers of tensors that functions map over leaf by leaf.
+"""Pytrees: nested containers of tensors that functions map over leaf by leaf.
 
-Dataclasses registered here, tuples, named tuples, lists and dictionaries are all containers. The registry is the one
-that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. It lives in ``torch.utils._pytree``: no
-release of torch offers it under a public name, and a second registry would not be seen by those functions.
+Tuples, named tuples, lists, dictionaries and the dataclasses that :func:`register` adds are containers; everything else
+is a leaf. States, such as :class:`torchmpm.ParticleState`, are pytrees. The registry is the one that ``torch.func``,
+``torch.utils.checkpoint`` and ``torch.compile`` use (``torch.utils._pytree``, as no release of torch offers it under a
+public name).
 """
 
 import functools
@@ -24,13 +25,31 @@ LARGEST_CACHE = 64
 
 
 def register(cls: type[Tree]) -> type[Tree]:
-    """Class decorator that registers a dataclass as a pytree whose children are its fields that are not ``None``.
+    """Register a dataclass as a pytree whose children are its fields that are not ``None``; a class decorator.
 
-    Instances rebuilt from leaves are those of :func:`unchecked`, because transforms such as ``torch.func.vmap`` put
-    leaves of other shapes in their place.
+    Instances are rebuilt from their leaves without ``__init__`` and ``__post_init__``, because transforms such as
+    ``torch.func.vmap`` put leaves of other shapes in their place.
 
     Args:
         cls: A dataclass whose fields are tensors, containers of tensors, or plain values, which are leaves.
+
+    Returns:
+        The class itself.
+
+    Raises:
+        TypeError: ``cls`` is not a dataclass.
+        ValueError: ``cls`` is registered already.
+
+    Examples:
+        >>> import torch, torchmpm
+        >>> from dataclasses import dataclass
+        >>> @torchmpm.tree.register
+        ... @dataclass(frozen=True, eq=False)
+        ... class Pair:
+        ...     first: torch.Tensor
+        ...     second: torch.Tensor
+        >>> torchmpm.tree.map(lambda t: 2 * t, Pair(torch.tensor(1), torch.tensor(2)))
+        Pair(first=tensor(2), second=tensor(4))
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
@@ -56,12 +75,15 @@ def unchecked(cls: type[Tree], *values: Any) -> Tree:
 
 
 def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to every tensor of a tree, with the tensors in the same place of other trees, for a new tree.
+    """Apply a function to every tensor of a tree.
 
     Args:
-        function: Called as ``function(tensor, *other_tensors)``.
-        tree: The tree; leaves that are not tensors are kept.
+        function: Called as ``function(tensor, *other_tensors)``, with the tensors in the same place of ``others``.
+        tree: The tree.
         others: Trees of the same structure.
+
+    Returns:
+        A tree of the same structure with the results; leaves that are not tensors are those of ``tree``.
 
     Raises:
         ValueError: The structures differ.
@@ -74,7 +96,11 @@ def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
 
 
 def leaves(tree: Any) -> list[Tensor]:
-    """All tensors of a tree, of shapes () or others, in order."""
+    """Return the tensors of a tree, of any shapes, in the order of the fields and items of its containers.
+
+    Args:
+        tree: The tree; leaves that are not tensors are left out.
+    """
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
@@ -105,7 +131,15 @@ def _closed(tree: Any) -> Any:
 
 
 def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree]]:
-    """All tensors of a tree, of shapes () or others, in order, and a function that makes it from as many others."""
+    """Take a tree apart into its tensors and a function that puts a tree of the same structure together.
+
+    Args:
+        tree: The tree.
+
+    Returns:
+        The tensors, of any shapes, in the order of :func:`leaves`; and a function from as many other tensors to a tree,
+        in which leaves that are not tensors are those of ``tree``.
+    """
     entries, structure = pytree.tree_flatten(tree)
     tensors = [entry for entry in entries if isinstance(entry, Tensor)]
     others = [None if isinstance(entry, Tensor) else (entry,) for entry in entries]  # does not keep the tensors alive
@@ -119,7 +153,7 @@ def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree
 
 
 def detach(tree: Tree) -> Tree:
-    """The same tree with every tensor detached from the autograd graph."""
+    """Return the same ``tree`` with every tensor detached from the autograd graph."""
     return map(Tensor.detach, tree)
 
 
@@ -143,12 +177,15 @@ def without_inference(tree: Tree) -> Tree:
 
 
 def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
-    """Select whole batch elements: those of ``tree`` where the mask holds, those of ``other`` elsewhere.
+    """Choose for each element of a batch between two trees.
 
     Args:
-        mask: (B,) bool.
+        mask: (B,) bool, true for the elements that are taken from ``tree``.
         tree: A tensor (B, ...) or a tree of them.
-        other: A tree of the same structure, shapes and dtypes.
+        other: A tree of the same structure, shapes and dtypes, from which the other elements are taken.
+
+    Returns:
+        A tree of the same structure; leaves that are not tensors are those of ``tree``.
 
     Raises:
         ValueError: ``mask`` is not bool of shape (B,), or the trees differ in structure, shapes or dtypes.
@@ -175,7 +212,7 @@ def has_tangents(tensors: Iterable[Tensor | None]) -> bool:
 
 
 def transforming() -> bool:
-    """Whether a transform of ``torch.func`` or a trace of ``make_fx`` is active."""
+    """Return whether a transform of ``torch.func`` or a trace of ``make_fx`` is active."""
     # torch.func has no public query for this.
     return bool(torch._C._are_functorch_transforms_active()) or get_proxy_mode() is not None
 

@@ -15,25 +15,54 @@ Value: TypeAlias = float | Tensor
 
 @runtime_checkable  # for checks of annotations, as the tests make them
 class Material(Protocol):
-    """Interface of a constitutive law.
+    """Interface of a constitutive law: any object with these four methods is a material.
 
-    All methods take ``F``, the components (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio
-    (B, N). The backend ``"eager"`` runs any material; the native kernels know those named in
-    ``torchmpm/native/tables.py``. A material may limit derivatives to the motion that a substep resolves, with the
-    methods ``resolved_stress`` and ``unresolved`` that :class:`torchmpm.Snow` has.
+    A matrix is given as its components: ``F`` is the tuple (F11, F12, F21, F22) of tensors (B, N), and a symmetric
+    matrix is the tuple (xx, xy, yy), here for the N particles of a body. The backend ``"eager"`` runs any material; the
+    native kernels run :class:`torchmpm.Elastic`, :class:`torchmpm.VonMises` and :class:`torchmpm.Snow` only. A material
+    may also have the two methods ``resolved_stress`` and ``unresolved`` of :class:`torchmpm.Snow`, which limit its
+    gradients.
     """
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Project the trial ``F`` onto the elastic range; returns the new components (B, N) and ``Jp`` (B, N)."""
+        """Bring a trial deformation gradient back to the elastic range, by plastic flow.
+
+        Args:
+            F: Components (B, N) of ``(I + dt C) F``, the deformation gradient after an elastic substep.
+            Jp: (B, N) plastic volume ratio.
+
+        Returns:
+            The components (B, N) of the new elastic deformation gradient, and the new ``Jp`` (B, N).
+        """
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress of the projected ``F``, components (B, N), Pa; ``Jp`` is from before the projection."""
+        """Return the Kirchhoff stress, the derivative of :meth:`energy` in F times the transpose of F.
+
+        Args:
+            F: Components (B, N) of the deformation gradient after :meth:`return_map`.
+            Jp: (B, N) plastic volume ratio before :meth:`return_map`.
+
+        Returns:
+            Components (xx, xy, yy), (B, N) each, Pa.
+        """
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
-        """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2 (two-dimensional)."""
+        """Return the stored energy per unit of undeformed volume.
+
+        Args:
+            F: Components (B, N) of the elastic deformation gradient.
+            Jp: (B, N) plastic volume ratio.
+
+        Returns:
+            (B, N), J/m^2 (two-dimensional).
+        """
 
     def stiffness(self) -> Value:
-        """Largest ratio of stress to strain (Frobenius norms) in undeformed material, Pa."""
+        """Return the largest ratio of stress to strain (Frobenius norms) in undeformed material, for the stable ``dt``.
+
+        Returns:
+            A number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count), Pa.
+        """
 
 
 def try_law(material: Material, F: Mat2, Jp: Tensor) -> None:
@@ -61,17 +90,26 @@ def _kind_of(given: Any) -> str:
 
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
-    """Lame parameters in plane strain.
+    """Return the Lame parameters of a material in plane strain.
+
+    They are ``mu = young / (2 (1 + poisson))`` and ``lam = young poisson / ((1 + poisson) (1 - 2 poisson))``.
 
     Args:
-        young: Young's modulus, Pa; a number or a tensor of any shape, such as (B,).
-        poisson: Poisson's ratio, between -1 and 0.5; likewise a number or a tensor.
+        young: Young's modulus, Pa, not negative; a number or a tensor of any shape, such as (B,).
+        poisson: Poisson's ratio, above -1 and below 0.5; a number, or a tensor whose shape broadcasts with ``young``.
 
     Returns:
-        (mu, lam) in Pa, numbers or tensors of the arguments' shape.
+        mu and lam, Pa, in this order; tensors if an argument is one.
 
     Raises:
-        ValueError: A number is out of range, or one of a tensor.
+        ValueError: A number, or an entry of a tensor, is out of range.
+        TypeError: A tensor is not dense.
+
+    Examples:
+        >>> import torchmpm
+        >>> mu, lam = torchmpm.lame(young=1000.0, poisson=0.25)
+        >>> mu, lam
+        (400.0, 400.0)
     """
     checks.entries("young", young, least=0.0)
     checks.entries("poisson", poisson, above=-1.0, below=0.5)
@@ -79,12 +117,12 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
 
 
 def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
-    """Bring a constant to a shape that broadcasts against components (B, N).
+    """Bring a constant of a material to a shape that broadcasts against components (B, N).
 
     Args:
-        value: The constant.
-        like: (B, N), gives shape, dtype and device.
-        name: Its name in error messages.
+        value: The constant, a number or a tensor, see :data:`torchmpm.materials.base.Value`.
+        like: (B, N), whose shape, dtype and device the result goes with.
+        name: Name of the constant in error messages.
 
     Returns:
         The number itself, or a tensor of shape (), (B, 1), (B, N) or (1, N).
@@ -107,7 +145,15 @@ def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
 
 
 def detached_column(value: Value) -> Value:
-    """A constant in float64 on the CPU, without graph; (B,) becomes (B, 1), so that it broadcasts against others."""
+    """Bring a constant to the form in which the stable ``dt`` is computed; for :meth:`torchmpm.Material.stiffness`.
+
+    Args:
+        value: The constant, a number or a tensor, see :data:`torchmpm.materials.base.Value`.
+
+    Returns:
+        The number itself; or the tensor in float64, on the CPU and without graph, with (B,) as (B, 1), so that it
+        broadcasts against constants of other shapes.
+    """
     if not isinstance(value, Tensor):
         return value
     value = value.detach().to("cpu", torch.float64)

@@ -17,20 +17,29 @@ METHODS = ("return_map", "stress", "energy", "stiffness")
 @tree.register
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A run of consecutive particles of one material.
+    """Consecutive particles of one material.
 
     Attributes:
         count: Number of particles.
-        material: Constitutive law, such as :class:`torchmpm.VonMises`.
+        material: Constitutive law: :class:`torchmpm.Elastic`, :class:`torchmpm.VonMises`, :class:`torchmpm.Snow`, or
+            another :class:`torchmpm.Material`.
         mass: Mass of a particle, kg; a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count). With
             less than about 1e-5 kg particles lose momentum, as 1e-10 kg are added to the mass of each node: a disc of
             radius 0.03 m with ten in a cell loses 2 % in 10,000 substeps at 1e-5 kg, 18 % at 1e-6 kg.
         volume: Undeformed volume of a particle, m^2 (two-dimensional); a number or a tensor of those shapes.
-        muscle: Whether the actuation field acts on it.
+        muscle: Whether the actuation of :meth:`torchmpm.Solver.step` acts on the particles.
 
     Raises:
-        ValueError: ``count`` is below 1, ``mass`` or ``volume`` is not positive, or ``muscle`` not True or False.
-        TypeError: The material is not a :class:`torchmpm.Material`.
+        ValueError: ``count`` is below 1, ``mass`` or ``volume`` is not positive (for a tensor: when a solver is made),
+            or ``muscle`` is not True or False.
+        TypeError: ``material`` is not a :class:`torchmpm.Material`, or a tensor is not dense.
+
+    Examples:
+        A disc of 1,000 particles with the density of water, 1,000 kg/m^2:
+
+        >>> import math, torchmpm
+        >>> volume = math.pi * 0.05**2 / 1000
+        >>> body = torchmpm.Body(1000, torchmpm.Elastic(mu=2e4, lam=2e4), mass=1000 * volume, volume=volume)
     """
 
     count: int

@@ -30,17 +30,25 @@ def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
 @tree.register
 @dataclass(frozen=True, eq=False)
 class Elastic:
-    """Fixed corotated elastic solid.
+    """Fixed corotated elastic solid (Stomakhin et al., "Energetically consistent invertible elasticity", 2012).
 
-    A constant is a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count) with the body's count.
+    The stored energy per unit of undeformed volume is ``mu |F - R|^2 + lam/2 (J - 1)^2`` with ``J = det F`` and the
+    orthogonal factor R of the polar decomposition ``F = R S``, and the Kirchhoff stress is
+    ``2 mu (F - R) F^T + lam J (J - 1) I``. A constant is a number or a tensor of shape (), (B,), (B, 1), (B, count) or
+    (1, count) with the body's count.
 
     Attributes:
-        mu: Second Lame parameter (shear modulus), Pa.
+        mu: Second Lame parameter (shear modulus), Pa, not negative.
         lam: First Lame parameter, Pa; negative for a negative Poisson's ratio, but not below -mu.
 
     Raises:
-        ValueError: ``mu`` is negative, or ``lam`` below -mu (for a tensor: when a solver with ``allow_unstable=False``
-            is made).
+        ValueError: ``mu`` is negative, or ``lam`` is below -mu (for a tensor: when a solver with
+            ``allow_unstable=False`` is made), or a constant is not finite.
+        TypeError: A tensor is not dense.
+
+    Examples:
+        >>> import torchmpm
+        >>> rubber = torchmpm.Elastic(*torchmpm.lame(young=1e5, poisson=0.3))
     """
 
     mu: Value

@@ -12,9 +12,9 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-#: Components (F11, F12, F21, F22) of a field of 2x2 matrices, all of one shape.
+#: Components (F11, F12, F21, F22) of a field of 2x2 matrices, four tensors of one shape, such as (B, N).
 Mat2: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
-#: Components (xx, xy, yy) of a field of symmetric matrices.
+#: Components (xx, xy, yy) of a field of symmetric 2x2 matrices, three tensors of one shape, such as (B, N).
 Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
 
 
@@ -74,7 +74,7 @@ def orthogonal(F: Mat2) -> Mat2:
 
 
 def det(F: Mat2) -> Tensor:
-    """Determinant."""
+    """Return the determinant of matrices ``F``, with the shape of one of their components."""
     a, b, c, d = F
     return a * d - b * c
 

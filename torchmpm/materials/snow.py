@@ -54,34 +54,41 @@ def _clamp(stretch: Tensor, low: Value, high: Value) -> Tensor:
 @tree.register
 @dataclass(frozen=True, eq=False)
 class Snow(Elastic):
-    """Snow or loose ground: stretches leave a narrow range plastically, and compaction hardens.
+    """Snow or loose ground (Stomakhin et al., "A material point method for snow simulation", 2013).
 
-    The default values are those of the soil in DittoGym's DIG. The plastic volume ratio Jp collects the area that
-    stretches lost to their bounds; the elastic constants are multiplied by ``exp(hardening (1 - Jp))`` within
-    ``hardening_range``, with Jp of the substep before. A constant is a number or a tensor of shape (), (B,), (B, 1),
+    The principal stretches of F are elastic within a narrow range; what exceeds it becomes plastic deformation. The
+    plastic volume ratio Jp is multiplied by the ratio of the area before this correction to that after it, so that it
+    falls below 1 under compaction. The stress is that of :class:`torchmpm.Elastic`, with constants that are multiplied
+    by ``exp(hardening (1 - Jp))``, clipped to ``hardening_range``, with Jp of the substep before. The default values
+    are those of the soil in DittoGym's task DIG. A constant is a number or a tensor of shape (), (B,), (B, 1),
     (B, count) or (1, count) with the body's count.
 
-    Gradients are deliberately not exact where a substep does not resolve the motion. Forward, plastic flow bounds such
-    motion; its exact derivative grows in every substep, until it overflows. So where hardened snow is stiffer than
-    substeps of this length allow (see :meth:`torchmpm.Solver.stable_dt`), its stress is differentiated with respect to
-    F with the largest stiffness that they do allow. And grains whose affine matrix C is so large that ``dt |C|``
-    exceeds 0.03 (Frobenius norm), such as grains that spin in the air, pass no derivative on to earlier substeps.
-    States are not affected, nor are gradients elsewhere. ``exact_gradients=True`` turns both limits off.
+    Gradients are deliberately not exact where a substep does not resolve the motion. In the forward direction, plastic
+    flow bounds such motion, but its exact derivative grows in every substep, until it overflows. So where hardened snow
+    is stiffer than substeps of this length allow (see :meth:`torchmpm.Solver.stable_dt`), its stress is differentiated
+    with respect to F as if it had the largest stiffness that they do allow. And grains whose affine matrix C is so
+    large that ``dt |C|`` exceeds 0.03 (Frobenius norm), such as grains that spin in the air, pass no derivative on to
+    earlier substeps. States are not affected, nor are gradients elsewhere. ``exact_gradients=True`` turns both limits
+    off.
 
     Attributes:
-        mu: Second Lame parameter at Jp = 1, Pa.
-        lam: First Lame parameter at Jp = 1, Pa.
-        compression: Principal stretches are kept above 1 - compression.
-        stretch: Principal stretches are kept below 1 + stretch.
-        hardening: Exponent.
-        hardening_range: Bounds of the factor on the elastic constants.
-        shear_cutoff: Shear stretch below this is dropped in every substep, so the material creeps. 1e-5 is the
-            threshold of the reference implementation's singular value decomposition, and part of DIG; 0 turns it off.
-        exact_gradients: Whether a solver differentiates the motion that its substeps do not resolve, too.
+        mu: Second Lame parameter at Jp = 1, Pa, not negative.
+        lam: First Lame parameter at Jp = 1, Pa, at least -mu.
+        compression: Principal stretches are kept above ``1 - compression``; dimensionless, from 0 to below 1.
+        stretch: Principal stretches are kept below ``1 + stretch``; dimensionless, not negative.
+        hardening: Factor in the exponent; dimensionless, not negative.
+        hardening_range: Lowest and highest factor on the elastic constants.
+        shear_cutoff: An off-diagonal entry of S in the polar decomposition ``F = R S`` whose magnitude is below this is
+            set to zero in every substep, so that the material creeps. 1e-5 is the threshold of the singular value
+            decomposition in the reference implementation, and part of DIG; 0 turns this off.
+        exact_gradients: Whether a solver also differentiates the motion that its substeps do not resolve.
 
     Raises:
-        ValueError: A value is negative, ``compression`` is not below 1, ``hardening_range`` is not a range, or
-            ``exact_gradients`` is not True or False.
+        ValueError: A value other than ``lam`` is negative, ``lam`` is below -mu (for a tensor: when a solver with
+            ``allow_unstable=False`` is made), a value is not finite, ``compression`` is not below 1,
+            ``hardening_range`` is not a tuple (low, high) with 0 <= low <= high, or ``exact_gradients`` is not True or
+            False.
+        TypeError: A tensor is not dense.
     """
 
     compression: Value = 0.025
@@ -128,9 +135,14 @@ class Snow(Elastic):
         return min(max(1.0, low), high) * super().stiffness()
 
     def resolved_stress(self, F: Mat2, Jp: Tensor, stable: Value) -> Sym2:
-        """As :meth:`stress`, with the derivative in F of a stiffness of at most ``stable``, (B, N) or a number, Pa.
+        """Return the stress, but with the derivative in F of a material of limited stiffness.
 
         All other derivatives, that in Jp among them, are exact.
+
+        Args:
+            F: Components (B, N) of the deformation gradient after the return map.
+            Jp: (B, N) plastic volume ratio before it.
+            stable: Largest stiffness, Pa; a number or a tensor that broadcasts to (B, N).
         """
         tau = self.stress(F, Jp)
         if self.exact_gradients:
@@ -143,9 +155,14 @@ class Snow(Elastic):
         return xx, xy, yy
 
     def unresolved(self, C: Mat2, dt: float) -> Tensor | None:
-        """Which grains pass no derivative on, (B, N) bool; ``None`` for none.
+        """Return which grains deform too much in a substep to pass a derivative on.
 
-        Those that deform too much in a substep of ``dt`` s; C are the affine matrices, (B, N) each, 1/s.
+        Args:
+            C: Components (B, N) of the affine matrices, 1/s.
+            dt: Duration of a substep, s.
+
+        Returns:
+            (B, N) bool; ``None`` if all of them pass derivatives on.
         """
         if self.exact_gradients:
             return None

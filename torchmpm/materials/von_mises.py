@@ -47,20 +47,25 @@ def yield_surface(limit: Value) -> YieldSurface:
 
 
 def von_mises_return(F: Mat2, limit: Value) -> Mat2:
-    """Closest point on the von Mises yield surface in principal logarithmic strains.
+    """Project a deformation gradient onto the von Mises yield surface in principal logarithmic strains.
 
-    With e_1 >= e_2 the logarithms of the principal stretches (floored at 0.05), the deviator has the norm
-    ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit`` = yield stress / (2 mu), the difference e_1 - e_2 is
-    brought back to its value d at yield and the volume is kept, but for stretches below the floor: plastic flow is
-    isochoric. Elsewhere F is returned unchanged. No logarithm and no SVD are needed: with g the geometric mean of the
-    stretches, their sum and difference after the return are 2 g cosh(d/2) and 2 g sinh(d/2), which rescale the two
-    parts of F (see ``torchmpm.materials.linalg``).
+    This is the return mapping of Gao et al. ("An adaptive generalized interpolation material point method for
+    simulating elastoplastic materials", 2017) with the constants of DittoGym (Huang et al., 2024). With e_1 >= e_2 the
+    logarithms of the principal stretches, which are floored at 0.05, the deviator has the norm
+    ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit``, the difference e_1 - e_2 is brought back to its
+    value d at yield, ``sqrt(2 (limit^2 - 1e-8))``, but at least 1e-4; the area is kept, unless a stretch is below the
+    floor. Elsewhere F is returned unchanged.
 
-    The derivative jumps at the yield surface; exactly on it this returns the elastic side.
+    No logarithm and no singular value decomposition are needed: every 2x2 matrix is the sum of a scaled rotation and a
+    scaled reflection, whose lengths are half the sum and half the difference of the principal stretches. With g the
+    geometric mean of the stretches, sum and difference after the return are 2 g cosh(d/2) and 2 g sinh(d/2).
+
+    The derivative jumps at the yield surface; exactly on it, it is that of the elastic side.
 
     Args:
-        F: Trial deformation gradient, components (B, N).
-        limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
+        F: Components (B, N) of the trial deformation gradient.
+        limit: Norm of the deviatoric logarithmic strain at yield, yield stress / (2 mu); a number or a tensor that
+            broadcasts to (B, N).
 
     Returns:
         Components (B, N) of the returned deformation gradient.
@@ -90,18 +95,21 @@ class VonMises(Elastic):
     """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
 
     The robot material of DittoGym (Huang et al., ICLR 2024): soft enough to be driven by muscles, plastic enough to
-    keep a new shape. A constant is a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count) with the
-    body's count.
+    keep a new shape. Its stress is that of :class:`torchmpm.Elastic`, its plastic flow that of
+    :func:`torchmpm.materials.von_mises.von_mises_return`. A constant is a number or a tensor of shape (), (B,), (B, 1),
+    (B, count) or (1, count) with the body's count.
 
     Attributes:
-        mu: Second Lame parameter, Pa.
-        lam: First Lame parameter, Pa.
+        mu: Second Lame parameter, Pa, positive.
+        lam: First Lame parameter, Pa, at least -mu.
         yield_stress: Norm of the deviatoric stress at yield, Pa, at small strain: the largest shear stress is
             ``yield_stress / sqrt(2)``. What is limited is the norm of the deviatoric logarithmic strain, to
             ``yield_stress / (2 mu)``; the stress there depends on the change of area too.
 
     Raises:
-        ValueError: ``mu`` is not positive, ``lam`` below -mu, or the yield stress negative.
+        ValueError: ``mu`` is not positive, ``lam`` is below -mu (for a tensor: when a solver with
+            ``allow_unstable=False`` is made), the yield stress is negative, or a constant is not finite.
+        TypeError: A tensor is not dense.
     """
 
     yield_stress: Value
