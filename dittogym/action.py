@@ -14,10 +14,15 @@ ActionLayout = Literal["image", "grid"]
 
 
 def to_grid_layout(action: Tensor, layout: ActionLayout) -> Tensor:
-    """Bring an action (B, 2, R, R) to the layout (component, x rightwards, y upwards).
+    """Bring actions to the layout ``"grid"``, which :func:`dittogym.core.step` takes.
 
-    With ``"image"`` a pixel of the action acts where the same pixel of the observation looks; the reference
-    implementation has ``"grid"``.
+    Args:
+        action: (..., R, R), such as (B, 2, R, R).
+        layout: The layout of ``action``: with ``"image"`` the last two indices are row, from the top, and column; with
+            ``"grid"`` they are x, to the right, and y, upwards.
+
+    Returns:
+        The same action, indexed (..., x, y); a view of it.
     """
     return action.flip(-2).transpose(-1, -2) if layout == "image" else action
 

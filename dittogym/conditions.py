@@ -43,14 +43,17 @@ _SINGLE = ("shift", "turn", "velocity", "chance")
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """From which ranges each episode draws its conditions, uniformly; a single number is always taken.
+    """Ranges from which each episode draws its conditions, for training under domain randomisation and for tests.
 
-    Entries of actions are those of the policy's own grid. A factor has no effect in a task whose bodies do not take the
-    constant, or that has no gravity. Rewards, ``info`` and pictures show what happens, not what the policy sees.
+    A pair (lowest, highest) is a range from which each episode draws uniformly. A single number always applies, except
+    that ``shift``, ``turn`` and ``velocity`` are largest values. The defaults change nothing. A factor has no effect in
+    a task whose bodies do not take the constant, or that has no gravity. Rewards, ``info`` and pictures show what
+    happens, not what the policy sees. The conditions of the present episodes are in ``env.env_state.conditions``,
+    tensors by name with a leading B, and the constants of their matter in ``env.env_state.physics``.
 
     Raises:
-        ValueError: A range is empty or out of bounds. The environment raises one where it has no room for a start, or
-            too few substeps for the matter.
+        ValueError: A range is not in order, or a number is out of bounds. The environment also raises one if it has no
+            room for a start, or if its substeps are too long for the matter.
 
     Examples:
         >>> import dittogym
@@ -63,29 +66,30 @@ class Conditions:
     """
 
     latency: int | tuple[int, int] = 0
-    """Control steps by which actions come late; the first ones of an episode are 0."""
+    """Control steps by which actions come late, whole numbers from 0; the first actions of an episode are 0."""
     action_noise: Range = 0.0
-    """Standard deviation of normal noise on each entry of an action, drawn anew in every step; 1 is full actuation."""
+    """Standard deviation of normal noise on each entry of an action, new in every step; 1 is full actuation."""
     action_dropout: Range = 0.0
-    """Share of the entries of an action that are set to 0 in every step."""
+    """Share of the entries of an action that are set to 0, from 0 to 1; they are chosen anew in every step."""
     observation_dropout: Range = 0.0
-    """Share of the entries of an image, 3 x 64 x 64, that are set to 0 in every step."""
+    """Share of the 3 x 64 x 64 entries of an observation that are set to 0, from 0 to 1; chosen anew in every step."""
     mu: Range = 1.0
-    """Factor on the second Lame parameter of the robot, and of objects without a material of their own."""
+    """Factor on the second Lame parameter of the robot, and of an object without a material of its own; positive."""
     yield_stress: Range = 1.0
-    """Factor on the yield stress of the robot."""
+    """Factor on the yield stress of the robot, not negative."""
     gravity: Range = 1.0
-    """Factor on gravity."""
+    """Factor on gravity, not negative."""
     shift: float = 0.0
-    """The robot starts up to so far, m, from its place, in x and in y, but not lower."""
+    """Largest distance, m, by which the robot's start is moved in x and in y, but not downwards; at most 1."""
     turn: float = 0.0
-    """The robot starts turned by up to so many degrees."""
+    """Largest angle, degrees, by which the robot is turned at the start, to either side."""
     velocity: float = 0.0
-    """The robot starts with up to so many m/s in x and in y."""
+    """Largest velocity, m/s, of the robot at the start, in x and in y, in either direction."""
     chance: float = 1.0
-    """Probability with which each of these applies to an episode."""
+    """Probability with which each of the conditions above applies to an episode, from 0 to 1."""
     grid: int | None = None
-    """Rows and columns of the grid on which a policy decides, if it is smaller than that of its actions."""
+    """Rows and columns of the grid on which noise and missing entries of actions are drawn, for a policy that decides
+    on a smaller grid than that of its actions; ``None``: the grid of the actions."""
 
     def __post_init__(self) -> None:
         if self.grid is not None:

@@ -20,9 +20,17 @@ def to_device(array: np.ndarray, device: torch.device) -> Tensor:
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
-    """Numbers, or an array of any shape, in the type and on the device of ``like``; kept, and shared by all calls.
+    """Return a tensor of constant values, which is kept and shared by all calls; do not write to it.
 
-    For reward functions, where ``x.new_tensor(values)`` would copy them to a GPU in every step, and wait for that.
+    It is for reward functions, where ``like.new_tensor(values)`` would copy the values to a GPU in every step, and wait
+    for that.
+
+    Args:
+        values: Numbers or an array, of any shape.
+        like: A tensor whose dtype and device the result has.
+
+    Returns:
+        A tensor of the shape of ``values``.
     """
     array = np.asarray(values)
     return _kept(array.tobytes(), array.dtype.str, array.shape, like.dtype, like.device)

@@ -1,4 +1,8 @@
-"""An environment as pure functions: :func:`reset` and :func:`step` of a :class:`Model` and an :class:`EnvState`."""
+"""An environment as pure functions: :func:`reset` and :func:`step` of a :class:`Model` and an :class:`EnvState`.
+
+They keep nothing, so that they work under ``torch.func`` and in checkpoints, where :class:`dittogym.TorchEnv` does not.
+``env.model`` and ``env.env_state`` of a :class:`dittogym.TorchEnv` are a model and a state.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ from torchmpm.checks import Segment
 from torchmpm.stability import check_gravity, stable_dt
 from torchmpm.tree import cached_tensors
 
-#: Reward of a step of an element whose state is no longer valid; its episode ends.
+#: Reward of a step after which a simulation cannot go on, see :func:`is_valid`; its episode ends.
 FAILURE_REWARD = -16.0
 #: Terms that the environment adds to those of a task.
 RESERVED_TERMS = frozenset({"split", "action", "alive", "failure"})
@@ -35,18 +39,19 @@ RESERVED_INFO |= {"episode", "final_obs", "final_info"}
 @tree.register
 @dataclass(frozen=True, eq=False)
 class EnvState:
-    """The complete state of B episodes, a pytree of tensors with leading dimension B.
+    """The complete state of B episodes, a pytree (see :mod:`torchmpm.tree`) of tensors with a leading B.
 
     Attributes:
-        particles: The matter.
+        particles: The state of all particles, robot first.
         origin: (B, 2) lower left corner of the window in the world, m.
-        centre: (B, 2) the robot's centre on which the next action is placed, m.
+        centre: (B, 2) the robot's centre in the world, on which the next action is placed, m.
         start: Averages right after the reset.
-        task_state: What the task remembers.
+        task_state: What the task remembers, tensors by name with a leading B.
         physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
-        steps: (B,) int64 control steps taken.
-        conditions: Of these episodes, see :class:`dittogym.Conditions`; empty without. The functions of this module
-            pass them on: only :class:`dittogym.TorchEnv` disturbs actions and images.
+        steps: (B,) int64, control steps since the reset.
+        conditions: The conditions of these episodes, tensors by name with a leading B, see
+            :class:`dittogym.Conditions`; empty without conditions. The functions of this module pass them on without
+            effect: only :class:`dittogym.TorchEnv` disturbs actions and observations.
     """
 
     particles: ParticleState
@@ -71,13 +76,13 @@ class EnvState:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A task at a certain fidelity: its solver, camera and rewards, without state.
+    """A task with a certain number of particles and length of substeps, without state; :func:`make_model` makes one.
 
     Attributes:
         spec: The task.
-        solver: Its physics.
-        substeps: Substeps of a control step.
-        camera: Draws observations.
+        solver: The solver of its physics.
+        substeps: Substeps in a control step.
+        camera: What draws the observations, for :func:`observe` and :func:`soft_observation`.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
     """
 
@@ -89,11 +94,15 @@ class Model:
 
     @functools.cached_property
     def num_robot_particles(self) -> int:
-        """The robot's particles come first."""
+        """Number of the robot's particles, which come first."""
         return self.solver.bodies[0].count
 
     def solver_for(self, physics: Physics) -> Solver:
-        """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
+        """Return the solver with other constants of the matter.
+
+        Args:
+            physics: Constants in place of the task's own, as :func:`dittogym.physics.physics_values` returns them.
+        """
         if not physics:
             return self.solver
         bodies = bodies_of(self.spec, self.camera.counts, self.camera.particle_weight, physics)
@@ -103,12 +112,19 @@ class Model:
 def make_model(
     spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, segment: Segment = "auto", dt: float = DT
 ) -> Model:
-    """Build the physics of a task with ``counts`` particles of each body.
+    """Make the model of a task.
 
-    The other arguments are as in :class:`dittogym.TorchEnv`.
+    Args:
+        spec: The task.
+        counts: Number of particles of each body, robot first.
+        substeps: Substeps in a control step.
+        backend: Backend of the solver, see :class:`torchmpm.Solver`.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
+        dt: Duration of a substep, s.
 
     Raises:
-        ValueError: The matter, its muscles or gravity need shorter substeps.
+        ValueError: ``backend`` is unknown or not available, there are other numbers of ``counts`` than bodies, or the
+            matter, its muscles or gravity need shorter substeps.
     """
     full = tuple(body.count for body in spec.bodies)
     weight = tuple(n / m for n, m in zip(full, counts, strict=True))
@@ -144,19 +160,20 @@ def check_stability(model: Model, physics: Physics) -> None:
 
 
 class StepResult(NamedTuple):
-    """What a control step comes to.
+    """The result of a control step.
 
     Attributes:
         state: The next state.
         observation: (B, 3, 64, 64) uint8.
-        reward: (B,), the sum of the terms.
+        reward: (B,), the sum of the terms; smooth if that was asked for.
         terms: Weighted reward terms by name, (B,) each.
-        terminated: (B,) bool.
-        success: (B,) bool; ``None`` where the task does not define it.
-        info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own; leading B.
-        true_reward: (B,) the task's reward; equal to ``reward`` unless that is smooth.
-        actuation: (B, 2, P, P) on the patch, Pa.
-        soft_observation: (B, 3, 64, 64) of :func:`soft_observation`; ``None`` unless the reward is smooth.
+        terminated: (B,) bool, whether the task ended the episode, or the simulation cannot go on.
+        success: (B,) bool, whether the task is solved now; ``None`` where the task does not define success.
+        info: Tensors by name with a leading B: ``com``, ``split``, ``finite``, ``object_com`` in tasks with an object,
+            see :meth:`dittogym.TorchEnv.step`, and the task's own quantities.
+        true_reward: (B,), the exact reward of the task.
+        actuation: (B, 2, P, P) muscle stress on the nodes of the action patch, Pa.
+        soft_observation: (B, 3, 64, 64), see :func:`soft_observation`; ``None`` unless the reward is smooth.
     """
 
     state: EnvState
@@ -174,22 +191,32 @@ class StepResult(NamedTuple):
 def reset(
     model: Model, positions: Tensor, physics: Physics | None = None, velocity: Tensor | None = None
 ) -> tuple[EnvState, Tensor]:
-    """Start episodes.
+    """Start episodes at given positions.
 
     Args:
         model: The task.
-        positions: (B, N, 2) in the world, m, robot first.
-        physics: Constants that differ from the task's, as :func:`dittogym.physics.physics_values` returns them. Whether
-            they are stable is not checked.
-        velocity: (B, 2) of all of the robot, m/s; all particles are at rest if not given.
+        positions: (B, N, 2) positions of the particles in the world, m, robot first.
+        physics: Constants in place of the task's own, as :func:`dittogym.physics.physics_values` returns them; ``None``
+            for the task's own. Whether the matter is stable with them is not checked.
+        velocity: (B, 2) velocity of all of the robot, m/s; ``None`` for rest.
 
     Returns:
-        State and observation (B, 3, 64, 64) uint8.
+        The state, and the observation (B, 3, 64, 64) uint8.
 
     Raises:
-        ValueError: ``positions`` are of another shape or type, ``physics`` holds an unknown name, or the task state has
-            another shape.
-        TypeError: The task state has no names.
+        ValueError: ``positions`` has another shape or dtype, ``physics`` holds an unknown name, or the task's
+            ``initial_task_state`` returns tensors without a leading B.
+        TypeError: The task's ``initial_task_state`` returns no mapping.
+
+    Examples:
+        >>> import dittogym, torch
+        >>> from dittogym import core
+        >>> env = dittogym.TorchEnv("run", particles=300, substeps=10)
+        >>> observation, info = env.reset(seed=0)
+        >>> state, observation = core.reset(env.model, env.state.x)
+        >>> result = core.step(env.model, state, torch.zeros(1, 2, 8, 8))
+        >>> result.reward.shape
+        torch.Size([1])
     """
     shape = model.solver.num_particles, 2
     if not isinstance(positions, Tensor) or positions.ndim != 3 or positions.shape[1:] != shape:
@@ -219,12 +246,14 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
     Args:
         model: The task.
         state: The present state.
-        action: (B, 2, R, R) in grid layout, see :func:`dittogym.action.to_grid_layout`, from -1 to 1. Elements with
-            numbers that are not finite end with :data:`FAILURE_REWARD`.
-        soft: Whether the reward is the smooth one, for gradients; all else is as without.
+        action: (B, 2, R, R) in the layout ``"grid"``, see :func:`dittogym.action.to_grid_layout`, from -1 to 1, with
+            the dtype of the state; R is at most the task's patch. A simulation with numbers that are not finite ends
+            with the reward :data:`FAILURE_REWARD`.
+        soft: Whether the reward is the smooth one, for gradients, and there is a smooth observation; everything else is
+            the same.
 
     Raises:
-        ValueError: ``action`` is of another shape or type.
+        ValueError: ``action`` has another shape or dtype.
     """
     x, shape = state.particles.x, action.shape if isinstance(action, Tensor) else ()
     square = len(shape) == 4 and shape[2] == shape[3] <= model.spec.patch
@@ -312,12 +341,32 @@ def _stop_gradients(value: Tensor, valid: list[Tensor]) -> Tensor:
 
 
 def observe(model: Model, state: EnvState) -> Tensor:
-    """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
+    """Return the observation of a state.
+
+    Args:
+        model: The task.
+        state: The state.
+
+    Returns:
+        (B, 3, 64, 64) uint8; particles whose numbers are not finite are not drawn.
+    """
     return model.camera.observe(state.particles.x, state.particles.v, state.origin, state.centre)
 
 
 def soft_observation(model: Model, state: EnvState) -> Tensor:
-    """The image as a smooth function of the state, see :meth:`dittogym.observation.Camera.observe_smoothly`."""
+    """Return the observation as a smooth function of the state, for gradients.
+
+    Each particle is spread over pixels by a quadratic B-spline, and the region around the robot and the obstacles move
+    over pixels without steps. The derivative jumps only where entries of the image, or velocities of particles at
+    5 m/s, saturate, at the edge of the simulated window, and where edges of obstacles meet edges of pixels.
+
+    Args:
+        model: The task.
+        state: The state.
+
+    Returns:
+        (B, 3, 64, 64) floating point, from 0 to 255 as in the uint8 observation, but not rounded.
+    """
     return model.camera.observe_smoothly(state.particles.x, state.particles.v, state.origin, state.centre)
 
 
@@ -358,7 +407,15 @@ def info_of(model: Model, state: EnvState, now: Features) -> dict[str, Tensor]:
 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:
-    """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
+    """Return which simulations can go on: all their numbers are finite, and some of the robot is in the window.
+
+    Args:
+        model: The task.
+        state: The state.
+
+    Returns:
+        (B,) bool.
+    """
     robot = state.particles.x[:, : model.num_robot_particles].detach()
     return state.particles.is_finite() & contains(robot, state.origin.detach()).any(1)
 

@@ -115,7 +115,7 @@ class Shell:
         return self.torch_env.state
 
     def save(self) -> Snapshot:
-        """Return a snapshot, which ``load`` restores; see :meth:`dittogym.TorchEnv.save`."""
+        """Return a snapshot, which ``load`` restores, see :meth:`dittogym.TorchEnv.save`."""
         return self.torch_env.save()
 
     def _picture(self, index: int) -> np.ndarray:
@@ -128,21 +128,35 @@ class Shell:
 class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
 
-    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper, so an id of your own needs
-    ``max_episode_steps`` in :func:`gymnasium.register`; made directly it truncates itself.
+    An environment of :func:`gymnasium.make` leaves the time limit to Gymnasium's wrapper, so an id of your own needs
+    ``max_episode_steps`` in :func:`gymnasium.register`; one that is made directly truncates episodes itself.
 
     Args:
-        task: Task name or specification.
-        render_mode: ``None``, ``"rgb_array"`` or ``"human"``: a window, which needs pygame. Space pauses, the
-            right arrow takes a single step, q or Escape closes the window; the simulation then goes on without it.
+        task: A task name, ``"MODULE:NAME"``, or a :class:`dittogym.TaskSpec`.
+        render_mode: ``None``; ``"rgb_array"``, for :meth:`render`; or ``"human"`` for a window, which needs pygame. In
+            the window, space pauses, the right arrow takes a single step, and q or Escape closes it, after which the
+            simulation goes on without a window.
         render_muscles: Colour the robot by its muscles in pictures.
-        render_size: Pixels per side of pictures, and of the window.
-        options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
+        render_size: Pixels per side of pictures and of the window, from 16 to 8192.
+        options: All arguments of :class:`dittogym.TorchEnv` except ``num_envs``.
+
+    Attributes:
+        torch_env: The :class:`dittogym.TorchEnv` behind it, a batch of one.
+        observation_space: ``Box(0, 255, (3, 64, 64), uint8)``.
+        action_space: ``Box(-1, 1, (2, R, R), float32)``.
 
     Raises:
-        ValueError: Unknown render mode, or as in :class:`dittogym.TorchEnv`.
-        TypeError: ``num_envs`` is given, or the task has no such option.
+        ValueError: The render mode is unknown, or as in :class:`dittogym.TorchEnv`.
+        TypeError: ``num_envs`` is given, or as in :class:`dittogym.TorchEnv`.
         ImportError: ``render_mode="human"`` without pygame.
+
+    Examples:
+        >>> import dittogym, gymnasium
+        >>> env = gymnasium.make("dittogym/run-coarse-v0", particles="lite")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> observation.shape, env.action_space.shape
+        ((3, 64, 64), (2, 8, 8))
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}
@@ -172,14 +186,15 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode, with the arguments of :meth:`dittogym.TorchEnv.reset`.
+        """Start a new episode, see :meth:`dittogym.TorchEnv.reset`, whose errors it raises.
 
         Args:
-            seed: Seed from which new initial positions are drawn.
+            seed: Seed from which new initial positions are drawn, from 0 to 2**32 - 1; ``None`` uses the last positions
+                again, unless the environment was made with ``resample=True``.
             options: The options of :meth:`dittogym.TorchEnv.reset`.
 
         Returns:
-            The observation (3, 64, 64) uint8, and ``info``.
+            The observation (3, 64, 64) uint8, and ``info`` as in :meth:`step`, without the entries of a step.
         """
         seed = None if seed is None else checks.whole("seed", seed, 0, MAX_SEED)
         with torch.no_grad():
@@ -190,14 +205,19 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(observation)), first(as_numpy(info))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance by one control step; see :meth:`dittogym.TorchEnv.step`.
+        """Advance by one control step, see :meth:`dittogym.TorchEnv.step`.
 
         Args:
-            action: (2, R, R) in [-1, 1].
+            action: (2, R, R) numbers in [-1, 1]; larger ones saturate.
 
         Returns:
-            Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays, NumPy scalars and
-            Python's bools; the reward terms have keys such as ``"reward_terms/velocity"``.
+            The observation (3, 64, 64) uint8, the reward, whether the task ended the episode, whether the time limit
+            did, and ``info`` with the entries of :meth:`dittogym.TorchEnv.step` as arrays, NumPy scalars and Python's
+            bools; the reward terms have keys such as ``"reward_terms/velocity"``.
+
+        Raises:
+            ValueError: The action has another shape or is not finite.
+            RuntimeError: The environment was not reset yet.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
@@ -209,9 +229,15 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(image)), reward, terminated, limit, first(info)
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`; returns its observation (3, 64, 64) uint8.
+        """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`, whose errors it raises.
 
         In mode ``"human"`` the return in the caption counts from here.
+
+        Args:
+            snapshot: What :meth:`save` returned here, or in an environment with the same options.
+
+        Returns:
+            The observation (3, 64, 64) uint8.
         """
         observation = self.torch_env.load(snapshot)
         self._return = 0.0
@@ -219,17 +245,26 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(observation))
 
     def render(self) -> np.ndarray | None:
-        """The picture (S, S, 3) uint8 of ``render_size`` S in mode ``"rgb_array"``, else nothing."""
+        """Return a picture (S, S, 3) uint8 in RGB, S the ``render_size``, in mode ``"rgb_array"``; else ``None``."""
         return self._picture(0) if self.render_mode == "rgb_array" else None
 
     def film(
         self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
     ) -> Recording:
-        """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
+        """Reset the environment, play an episode and record it.
 
-        ``path``, ``seed`` and ``options`` are as there; ``policy`` gets one observation (3, 64, 64) and returns one
-        action (2, R, R). Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with
-        ``env.unwrapped.film``.
+        See :meth:`dittogym.TorchEnv.film`, whose errors it raises. Wrappers have no part in it: an environment of
+        ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
+
+        Args:
+            policy: As in :meth:`dittogym.TorchEnv.film`, but it gets one observation (3, 64, 64) uint8 and returns one
+                action (2, R, R).
+            path: The file to write, as in :meth:`dittogym.TorchEnv.film`; ``None`` writes nothing.
+            seed: Seed of the reset and of the policy's noise.
+            options: ``max_steps`` and options of the file, as in :meth:`dittogym.TorchEnv.film`.
+
+        Returns:
+            The recording, which a notebook shows.
         """
         return film(self.torch_env, self.acting(policy), path, seed, **options)
 
@@ -240,7 +275,7 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def window_open(self) -> bool:
-        """Whether there is a window: in mode ``"human"``, until it is closed."""
+        """Whether a window is open, as it is in mode ``"human"`` until it is closed."""
         return self._screen is not None
 
     def close(self) -> None:

@@ -26,14 +26,15 @@ FLOOR_NODE = 19
 
 @dataclass(frozen=True)
 class Window:
-    """Where the window lies in the world.
+    """Where the simulated window, 1 m wide and high, lies in the world; its lower end is at y = 0.
 
     Attributes:
         left: The left end of a fixed window, m.
-        follow: Of a moving window, the distance of the robot's centre from its left end, m.
+        follow: For a window that moves with the robot, the distance of the robot's centre from its left end, m;
+            ``None`` for a fixed window.
 
     Raises:
-        ValueError: Both are given.
+        ValueError: Both are given, or one is not a number.
     """
 
     left: float = 0.0
@@ -74,7 +75,18 @@ def centre_in_window(centre: Centre, robot: Tensor, origin: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box in the world, m; an infinite bound leaves a side open, ``closed`` includes the bounds."""
+    """An axis-aligned box in the world; an infinite bound leaves a side open.
+
+    Attributes:
+        left: Lower bound of x, m.
+        right: Upper bound of x, m.
+        bottom: Lower bound of y, m.
+        top: Upper bound of y, m.
+        closed: Whether the bounds belong to the box, which matters for pixels whose edge lies on a bound.
+
+    Raises:
+        ValueError: A bound is not a number, or bounds are not in order.
+    """
 
     left: float = -inf
     right: float = inf
@@ -98,19 +110,27 @@ def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: flo
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Something that does not move.
+    """Something that does not move; :func:`solid`, :func:`floor` and others make common ones.
 
     Particles cannot enter its boxes, and the boxes are drawn in the observation and in
     :meth:`dittogym.TorchEnv.render`. ``rules`` replaces the effect on particles, and ``observed`` what the observation
     shows.
 
     Attributes:
-        name: For messages and docs.
-        boxes: Boxes with edges on nodes, at least 4 nodes wide and high unless ``rules`` are given.
-        friction: Coulomb coefficient of their faces; ``math.inf`` sticks, ``None`` stands for 0. Rules have their own.
-        rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
-            node the first in the task's list counts.
-        observed: The boxes that the robot sees instead, in the occupancy channel; ``()``: it is invisible.
+        name: Its name in messages.
+        boxes: Boxes whose edges lie on nodes, at multiples of 1/128 m, at least 4 nodes wide and high; any boxes if
+            ``rules`` are given.
+        friction: Coulomb coefficient of the faces of the boxes; ``math.inf`` is no slip, ``None`` stands for 0. It must
+            not be given with ``rules``, which have coefficients of their own.
+        rules: What it does to matter in place of what follows from the boxes, see :class:`torchmpm.VelocityRule`;
+            ``()`` for nothing.
+        observed: The boxes that the occupancy channel of the observation shows in place of ``boxes``; ``()`` makes it
+            invisible.
+
+    Raises:
+        ValueError: A box is too small, or its edges are not on nodes; ``friction`` is negative, or given with
+            ``rules``; or there are neither boxes nor rules nor observed boxes.
+        TypeError: A value has another type.
     """
 
     name: str
@@ -136,18 +156,22 @@ class Obstacle:
 
     @property
     def velocity_rules(self) -> tuple[VelocityRule, ...]:
-        """What it does to matter."""
+        """The rules by which it acts on matter, ``rules`` or those that follow from the boxes."""
         if self.rules is not None:
             return self.rules
         return tuple(rule for box in self.boxes for rule in _faces(box, self.friction or 0.0))
 
     @property
     def observed_boxes(self) -> tuple[Box, ...]:
-        """What the robot sees of it."""
+        """The boxes that the observation shows, ``observed`` or its own."""
         return self.boxes if self.observed is None else self.observed
 
     def with_friction(self, friction: float) -> Obstacle:
-        """The same obstacle with another Coulomb coefficient on all its faces."""
+        """Return the same obstacle with another friction on all its faces, also on those of ``rules``.
+
+        Args:
+            friction: Coulomb coefficient; ``math.inf`` is no slip.
+        """
         if self.rules is None:
             return replace(self, friction=friction)
         return replace(self, rules=tuple(replace(rule, friction=friction) for rule in self.rules))
@@ -174,12 +198,12 @@ def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:
 
 
 def floor(*, friction: float = inf) -> Obstacle:
-    """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts).
+    """Return the ground of DittoGym's tasks, up to node 19, which the observation does not show.
 
-    For ground of another height use :func:`solid`.
+    It supports matter at about 0.156 m. For ground of another height use :func:`solid`.
 
     Args:
-        friction: Coulomb coefficient; ``math.inf`` sticks.
+        friction: Coulomb coefficient; the default ``math.inf`` is no slip, as in the reference implementation.
 
     Raises:
         ValueError: ``friction`` is negative or not a number.
@@ -189,10 +213,10 @@ def floor(*, friction: float = inf) -> Obstacle:
 
 
 def ceiling(node: int) -> Obstacle:
-    """Upper end of the world: from this node on, nothing rises.
+    """Return the upper end of the world, from which on nothing rises, and which the observation does not show.
 
     Args:
-        node: Index of the node, counted upwards from the world's origin.
+        node: Index of the first node, counted upwards from the world's origin; node j is at j/128 m.
 
     Raises:
         ValueError: ``node`` is not a whole number from 0 on.
@@ -202,10 +226,10 @@ def ceiling(node: int) -> Obstacle:
 
 
 def side_walls(top: int | None) -> Obstacle:
-    """Invisible walls at x = -0.25 m and x = 0.25 m, as GROW, DIG and CATCH have them.
+    """Return walls at x = -0.25 m and x = 0.25 m, as in GROW, DIG and CATCH, which the observation does not show.
 
     Args:
-        top: Their last node, counted upwards from the world's origin; ``None``: they have no end.
+        top: Index of their last node, counted upwards from the world's origin; ``None`` for walls without an end.
 
     Raises:
         ValueError: ``top`` is not a whole number from 0 on.
@@ -219,18 +243,25 @@ def side_walls(top: int | None) -> Obstacle:
 
 
 def solid(name: str, i: Range, j: Range, *, visible: bool = True, friction: float = 0.0) -> Obstacle:
-    """A box of nodes that matter cannot enter.
+    """Return an obstacle in the form of a box that matter cannot enter.
 
     Args:
-        name: For messages and docs.
-        i: Inclusive range of world node indices in x; ``None`` at an end leaves it open.
-        j: The same in y.
-        visible: Whether the robot sees it.
-        friction: Coulomb coefficient of its faces; ``math.inf`` sticks, as the floor does.
+        name: Its name in messages.
+        i: Range (first, last) of node indices in x, both included, counted from the world's origin; node i is at
+            i/128 m, and ``None`` leaves an end open.
+        j: The same in y, counted upwards.
+        visible: Whether the observation shows it.
+        friction: Coulomb coefficient of its faces; ``math.inf`` is no slip, as on the floor.
 
     Raises:
-        ValueError: A range is not two node indices in order, the friction is negative, or the box is narrower than
-            four nodes.
+        ValueError: A range is not two node indices in order, the friction is negative, the box is narrower than four
+            nodes, or ``visible`` is not True or False.
+
+    Examples:
+        >>> import dittogym
+        >>> from dittogym.geometry import ceiling, floor, solid
+        >>> step = solid("step", i=(40, 60), j=(None, 24), friction=0.5)
+        >>> env = dittogym.TorchEnv("run", obstacles=(step, floor(friction=0.5), ceiling(119)), particles="lite")
     """
     checks.flag("visible", visible)
     inside = VelocityRule("+x", i, j)  # checks the ranges

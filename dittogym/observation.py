@@ -144,21 +144,29 @@ def encode(means: Tensor) -> Tensor:
 
 
 def silhouette(observation: Tensor) -> Tensor:
-    """Occupied pixels of an observation (B, 3, 64, 64) uint8: (B, 64, 64) bool."""
+    """Return which pixels of an observation show matter: those whose occupancy is at least 80 of 255.
+
+    Args:
+        observation: (B, 3, 64, 64) uint8.
+
+    Returns:
+        (B, 64, 64) bool.
+    """
     return observation[:, 0] >= OCCUPIED
 
 
 def soft_silhouette(observation: Tensor) -> Tensor:
-    """Probability of each pixel to belong to the :func:`silhouette` with full particles.
+    """Return the probability with which each pixel would belong to the :func:`silhouette`, for gradients.
 
-    ``sigmoid((n - 24.8) / 3.3)`` for n expected full particles, fitted to random positions, as a function of the
-    occupancy ``1 - exp(-n / SATURATION)``, which includes the background.
+    With n the number of full-size particles that are expected in a pixel, it is ``sigmoid((n - 24.8) / 3.3)``, which
+    was fitted to random positions of full particle counts. The number n follows from the occupancy
+    ``1 - exp(-n / 66.4)``, which includes obstacles and goal.
 
     Args:
         observation: (B, 3, 64, 64) from :func:`dittogym.core.soft_observation`.
 
     Returns:
-        (B, 64, 64), 0 to 1.
+        (B, 64, 64), from 0 to 1.
     """
     free = (1.0 - observation[:, 0] / 255.0).clamp_min(0.0)
     return 1.0 / (1.0 + math.exp(OCCUPIED_COUNT / OCCUPIED_WIDTH) * free ** (SATURATION / OCCUPIED_WIDTH))

@@ -41,17 +41,26 @@ def value_of(name: str, physics: Physics, spec: TaskSpec, like: Tensor) -> Tenso
 
 
 def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor]:
-    """Check constants and bring them to one value per simulation or particle; gradients flow through.
+    """Check constants of the matter and bring them to one value per simulation or particle.
+
+    Gradients flow from the result to the given values.
 
     Args:
-        given: Mapping from ``dittogym.physics.NAMES`` to numbers or arrays of shape () or (B,); for ``gravity`` (2,) or
-            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first. Of particles whose body has a material of
-            its own (the soil of DIG) only the mass has an effect; the yield stress of objects has none.
-        particles: Number N of particles.
-        like: (B,), gives dtype and device.
+        given: A mapping with any of ``"mu"`` and ``"lam"``, the Lame parameters of the robot and of an object without a
+            material of its own, Pa; ``"yield_stress"`` and ``"max_actuation"`` of the robot, Pa; ``"mass"``, a factor
+            on the masses of all particles; and ``"gravity"``, (x, y) in m/s^2. Values are numbers, arrays or tensors of
+            shape () or (B,), for gravity (2,) or (B, 2). ``mu``, ``lam``, ``yield_stress`` and ``mass`` may also be
+            (B, N), one value for each particle, robot first. Of particles whose body has a material of its own, such as
+            the soil of DIG, only the mass has an effect; the yield stress of an object has none.
+        particles: N, the number of particles.
+        like: (B,), whose dtype and device the result has.
+
+    Returns:
+        Tensors by name, (B,) or (B, N) each; gravity (B, 2).
 
     Raises:
-        ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite or out of range.
+        ValueError: ``given`` is not a mapping, a name is unknown, or a value has the wrong shape, is not finite or is
+            out of range: ``mu`` and ``mass`` must be positive, ``yield_stress`` and ``max_actuation`` not negative.
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"physics must be a mapping from {', '.join(NAMES)} to values, got {type(given).__name__}")

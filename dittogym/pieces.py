@@ -13,15 +13,19 @@ _NEIGHBOURS = np.stack((np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))))
 
 
 def largest_piece(x: Tensor, origin: Tensor) -> np.ndarray:
-    """Share of the particles, (B,) from 0 to 1, that the largest connected piece of each robot holds.
+    """Return the share of a robot's particles that its largest connected piece holds.
 
-    A piece consists of cells of the grid, 1/128 m wide, that hold particles. Of these only blocks of 2 x 2 count, so
-    that a strand one cell wide connects nothing and belongs to no piece; cells that touch, even at a corner, are
+    A piece consists of cells of the grid, 1/128 m wide, that hold particles. Only blocks of 2 x 2 such cells count, so
+    that a strand one cell wide connects nothing and belongs to no piece; blocks that touch, even at a corner, are
     connected. With fewer than about 2,000 particles robots have holes, and the share means little.
 
     Args:
-        x: (B, N, 2) positions of the robots' particles, m. Those outside the window, or not finite, are in no piece.
-        origin: (B, 2) lower left corners of the windows, m.
+        x: (B, N, 2) positions of the robots' particles in the world, m. Particles outside the window, or whose position
+            is not finite, are in no piece.
+        origin: (B, 2) lower left corners of the windows, m, as in ``env.env_state.origin``.
+
+    Returns:
+        (B,) shares from 0 to 1.
     """
     x_cell, y_cell = ((x - origin[:, None]) * NODES).detach().cpu().numpy().transpose(2, 0, 1)
     robot, particle = np.nonzero((x_cell >= 0) & (x_cell < NODES) & (y_cell >= 0) & (y_cell < NODES))

@@ -28,13 +28,13 @@ def register(task: str, make: Callable[..., TaskSpec]) -> None:
     A name that is registered again, as in a notebook's cell that is run twice, stands for the later function.
 
     Args:
-        task: Its name; the ids are ``dittogym/{task}-coarse-v0`` and ``dittogym/{task}-fine-v0``.
-        make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
-            Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` too.
+        task: Name of the task, one word; the ids are ``dittogym/{task}-coarse-v0`` and ``dittogym/{task}-fine-v0``.
+        make: A function that returns the specification. Its arguments, which need defaults, become options of the
+            environment. If one of them lengthens the horizon, pass ``max_episode_steps`` to ``gymnasium.make``, too.
 
     Raises:
-        ValueError: The name is that of a task of the library, differs from that in the specification or is not one
-            word, or an argument of ``make`` is one of the environments too.
+        ValueError: ``task`` is the name of a task of the library, is not the name in the specification, or is not one
+            word, or an argument of ``make`` has the name of an argument of the environments.
         TypeError: ``make`` is not a function without required arguments that returns a :class:`dittogym.TaskSpec`.
 
     Examples:

@@ -29,14 +29,14 @@ TaskState: TypeAlias = Mapping[str, Tensor]
 @tree.register
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Averages over the bodies of a state.
+    """Averages over the robot and over the object of a task.
 
     Attributes:
         com: (B, 2) mean position of the robot's particles in the world, m.
-        velocity: (B, 2) their mean velocity, m/s.
-        radius_of_gyration: (B,) spread of the robot, sqrt(Var x + Var y), m.
+        velocity: (B, 2) mean velocity of the robot's particles, m/s.
+        radius_of_gyration: (B,) spread of the robot, ``sqrt(Var x + Var y)`` over its particles, m.
         object_com: (B, 2) mean position of the object's particles, m; ``None`` in tasks without an object.
-        object_velocity: (B, 2) their mean velocity, m/s.
+        object_velocity: (B, 2) mean velocity of the object's particles, m/s; ``None`` in tasks without an object.
     """
 
     com: Tensor
@@ -59,16 +59,16 @@ def features_of(particles: ParticleState, num_robot_particles: int) -> Features:
 
 
 class Transition(NamedTuple):
-    """What a reward function may look at after a step. Do not change its tensors in place: they belong to the state.
+    """What a reward function gets after a step. Do not change its tensors in place: they belong to the state.
 
     Attributes:
         particles: The state of all particles.
-        num_robot_particles: The robot's particles come first.
+        num_robot_particles: Number of the robot's particles, which come first.
         now: Averages after the step.
         start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8, or for a smooth reward that of :func:`dittogym.core.soft_observation`.
-        task_state: What the task remembers, tensors with a leading B.
-        ops: Operations that have a smooth form, see :class:`RewardOps`.
+        observation: (B, 3, 64, 64) uint8; for a smooth reward, that of :func:`dittogym.core.soft_observation`.
+        task_state: What the task remembers, tensors by name with a leading B.
+        ops: Operations in an exact or in a smooth form, whichever the reward is to have.
     """
 
     particles: ParticleState
@@ -81,12 +81,12 @@ class Transition(NamedTuple):
 
     @property
     def robot_x(self) -> Tensor:
-        """Positions (B, n, 2) of the robot's particles, m."""
+        """Positions (B, n, 2) of the robot's n particles in the world, m."""
         return self.particles.x[:, : self.num_robot_particles]
 
     @property
     def object_com(self) -> Tensor:
-        """Mean position (B, 2) of the object's particles, m.
+        """Mean position (B, 2) of the object's particles in the world, m.
 
         Raises:
             ValueError: The task has no object.
@@ -101,13 +101,19 @@ class Reward(NamedTuple):
 
     Attributes:
         terms: Reward terms (B,) by name. The environment multiplies each by its weight in ``TaskSpec.weights`` and adds
-            the terms ``split``, ``action``, ``alive`` and ``failure``.
-        terminated: (B,) bool, the task's own reasons to end the episode; ``None`` if there are none.
-        success: (B,) bool; ``None`` where success is not defined.
-        info: Further quantities for ``info``, with a leading B.
-        task_state: Replaces the task's state, leading B, with the same names and shapes; ``None`` keeps it. Tensors of
-            int64 of shape (B, K) hold particle indices, in place of which planners with fewer particles keep their own
-            from the start of the episode.
+            its own terms ``split``, ``action``, ``alive`` and ``failure``.
+        terminated: (B,) bool, whether the task ends the episode; ``None`` if it never does.
+        success: (B,) bool, whether the task is solved now; ``None`` where success is not defined.
+        info: Further quantities for ``info``, tensors by name with a leading B; ``None`` for none.
+        task_state: What the task remembers from now on, with the names and shapes of ``initial_task_state``; ``None``
+            keeps what it remembers. A tensor of int64 of shape (B, K) is taken for indices of particles: planners that
+            simulate fewer particles keep their own indices from the start of the episode instead.
+
+    Examples:
+        >>> import dittogym
+        >>> def reward_fn(transition, spec):
+        ...     height = transition.now.com[:, 1] - transition.start.com[:, 1]
+        ...     return dittogym.Reward({"height": height}, success=height > 0.03)
     """
 
     terms: Mapping[str, Tensor]
@@ -119,10 +125,10 @@ class Reward(NamedTuple):
 
 @dataclass(frozen=True)
 class RewardOps:
-    """Operations that rewards need and that have no useful derivative, each in an exact and a smooth form.
+    """Operations of rewards that have no useful derivative, each in an exact and in a smooth form.
 
     Attributes:
-        smooth: Whether these are the smooth forms, for gradients, or the exact ones, as the task defines them.
+        smooth: True for the smooth forms, for gradients; False for the exact ones, as the task defines them.
     """
 
     smooth: bool
@@ -136,10 +142,14 @@ class RewardOps:
         corresponding term at ``low``.
 
         Args:
-            z: Of any shape.
-            low: Least value; ``None``: unbounded.
-            high: Largest value; ``None``: unbounded.
-            width: w, in units of ``z``; ``None``: a twentieth of the limit's size, for a limit of 0 of the other's.
+            z: A tensor of any shape.
+            low: Least value; ``None`` for no bound.
+            high: Largest value; ``None`` for no bound.
+            width: w, in the unit of ``z``; ``None`` stands for a twentieth of the magnitude of the limit or, at a limit
+                of 0, of the other limit.
+
+        Returns:
+            A tensor of the shape of ``z``.
 
         Raises:
             ValueError: ``width`` is not positive, or is not given and all limits are 0, or ``low`` is above ``high``.
@@ -160,31 +170,50 @@ class RewardOps:
         return z
 
     def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``, with a positive ``width``."""
+        """Return 1 where ``z`` is positive and 0 elsewhere; in the smooth form, the sigmoid of ``z / width``.
+
+        Args:
+            z: A tensor of any shape.
+            width: Width of the smooth step, in the unit of ``z``.
+
+        Returns:
+            A tensor of the shape and dtype of ``z``.
+
+        Raises:
+            ValueError: ``width`` is not positive.
+        """
         if not width > 0:
             raise ValueError(f"width must be positive, got {width!r}")
         return torch.sigmoid(z / width) if self.smooth else (z > 0).to(z.dtype)
 
     def split_penalty(self, radius: Tensor, limit: float) -> Tensor:
-        """Penalty ``-(20 r)^2``, (B,), once the radius of gyration r (B,), m, exceeds ``limit``.
+        """Return the penalty ``-(20 r)^2`` of a robot whose radius of gyration r exceeds a limit, else 0.
 
-        The exact form counts r up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
-        keeps growing.
+        In the exact form, r counts up to 0.2 m only. The smooth form sets in over a width of ``limit / 20``, and keeps
+        growing.
+
+        Args:
+            radius: (B,) r, m.
+            limit: The limit, m.
+
+        Returns:
+            (B,).
         """
         counted = radius if self.smooth else radius.clamp_max(SPLIT_CAP)
         return -(20.0 * counted).square() * self.heaviside(radius - limit, RELATIVE_WIDTH * limit)
 
     def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
+        """Return the mean of values over the particles nearest to a point.
 
-        In the smooth form all particles count, with weights that fall off around the distance within which there are
-        as many, over :data:`SELECTION_WIDTH`.
+        The exact form leaves out the one of these particles that has the largest absolute x, as the reference
+        implementation does. In the smooth form all particles count, with weights that fall off around the distance
+        within which the chosen fraction lies, over a width of 0.005 m.
 
         Args:
-            values: (B, N, K).
+            values: (B, N, K) values of the particles.
             x: (B, N, 2) positions of the particles, m.
-            point: (B, 2), m.
-            fraction: How many to choose, as a fraction of all, above 0 and at most 1.
+            point: (B, 2) the point, m.
+            fraction: Fraction of the particles to choose, above 0 and at most 1.
 
         Returns:
             (B, K).
@@ -203,7 +232,15 @@ class RewardOps:
         return (weight * values).sum(1) / weight.sum(1)
 
     def silhouette(self, observation: Tensor) -> Tensor:
-        """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
+        """Return the pixels in which an observation shows matter.
+
+        Args:
+            observation: (B, 3, 64, 64), as in :class:`dittogym.Transition`.
+
+        Returns:
+            (B, 64, 64) bool, see :func:`dittogym.observation.silhouette`; in the smooth form probabilities, see
+            :func:`dittogym.observation.soft_silhouette`.
+        """
         return soft_silhouette(observation) if self.smooth else silhouette(observation)
 
 
@@ -216,14 +253,14 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
 
 
 def distance(x: Tensor, point: Tensor | Sequence[float]) -> Tensor:
-    """Distances from a point, m, whose derivative is 0 where they coincide.
+    """Return distances from a point; where a distance is 0, its derivative is 0 and not NaN.
 
     Args:
-        x: (B, N, 2), or (B, 2) for one position in each simulation, m.
+        x: (B, N, 2) positions, or (B, 2) for one position in each simulation, m.
         point: (B, 2), or two numbers for the same point in all simulations, m.
 
     Returns:
-        (B, N) or (B,).
+        (B, N) or (B,), m.
 
     Raises:
         ValueError: The point has another number of coordinates.

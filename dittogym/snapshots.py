@@ -19,12 +19,13 @@ from torchmpm import tree
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A saved state of an environment, see :meth:`dittogym.TorchEnv.save`.
+    """A saved state of an environment, see :meth:`dittogym.TorchEnv.save`; ``torch.save`` writes it to a file.
 
     Attributes:
         state: Everything that moves.
-        observation: (B, 3, 64, 64) uint8.
-        constants: What the environment that loads it must share, see :func:`constants_of`.
+        observation: (B, 3, 64, 64) uint8, the last observation.
+        constants: What an environment that loads it must have in common: task, numbers of particles, substeps, dtype,
+            device and the like, by name, as text that is equal for equal values.
     """
 
     state: EnvState
@@ -32,7 +33,11 @@ class Snapshot:
     constants: Mapping[str, str]
 
     def __getitem__(self, index: int) -> Snapshot:
-        """That of one simulation of the batch, which can be loaded into all elements of another."""
+        """Select one simulation of the batch, a snapshot that can be loaded into all elements of an environment.
+
+        Raises:
+            IndexError: There is no such simulation.
+        """
         return Snapshot(tree.map(lambda value: value[[index]], self.state), self.observation[[index]], self.constants)
 
     def __repr__(self) -> str:

@@ -22,16 +22,22 @@ DT = 1e-4
 
 @dataclass(frozen=True)
 class BodySpec:
-    """Particles of one kind.
+    """A body of a task: the robot or an object.
 
     Attributes:
-        shape: Where they start.
+        shape: Where its particles start, one of :mod:`dittogym.bodies.shapes`.
         count: Number of particles with ``particles="full"``.
-        mass: Mass of a particle with ``particles="full"``, kg.
-        material: ``None``: with the constants of the task, a von Mises material for the robot, an elastic one for an
-            object.
-        lite: Number of particles with ``particles="lite"``; ``None``: 2,000 for the robot, in proportion for an object.
-        hidden_velocity: Whether the velocity channels of the observation leave it out.
+        mass: Mass of a particle with ``particles="full"``, kg. With other numbers of particles the mass of the body
+            stays the same. Each particle of full size has the undeformed volume 1 m^2.
+        material: Its material, a :class:`torchmpm.Material`; ``None`` for one with the constants of the task, a
+            :class:`torchmpm.VonMises` for the robot and a :class:`torchmpm.Elastic` for an object.
+        lite: Number of particles with ``particles="lite"``; ``None`` stands for 2,000, or ``count`` if that is less,
+            for the robot, and for a number in proportion for an object.
+        hidden_velocity: Whether the velocity channels of the observation leave the body out.
+
+    Raises:
+        ValueError: A number is out of range, or ``hidden_velocity`` is not True or False.
+        TypeError: ``shape`` is not a :class:`dittogym.bodies.shapes.Shape`.
     """
 
     shape: Shape
@@ -57,38 +63,46 @@ def no_task_state(transition: Transition, spec: TaskSpec) -> TaskState:
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """Everything that makes a task.
+    """A task as data: what is in the world, how it is seen and driven, and what is rewarded.
+
+    ``dataclasses.replace`` derives a task from another one, such as :func:`dittogym.make_spec` returns.
 
     Attributes:
-        name: Part of the environment id.
+        name: Name of the task, part of the ids ``dittogym/{name}-coarse-v0`` and ``dittogym/{name}-fine-v0``.
         horizon: Control steps of an episode.
         robot: The robot.
-        mu: Second Lame parameter of robot and elastic object, Pa.
-        lam: First Lame parameter, Pa.
-        yield_stress: Of the robot, Pa.
-        max_actuation: Muscle stress at action 1, Pa.
-        reward_fn: The task's own reward terms, termination and success, from a :class:`dittogym.rewards.Transition`
-            and this specification. Operations of ``transition.ops`` give the reward a smooth form.
-        weights: Weights of the reward terms of ``reward_fn`` by name, and any of ``split`` (a torn robot, where there
-            is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every step).
+        mu: Second Lame parameter of the robot, and of an object without a material of its own, Pa; positive.
+        yield_stress: Yield stress of the robot, Pa; not negative.
+        max_actuation: Muscle stress at action 1, Pa; not negative.
+        reward_fn: A function that takes a :class:`dittogym.Transition` and this specification, and returns a
+            :class:`dittogym.Reward`. With the operations of ``transition.ops`` the reward has a smooth form, too.
+        weights: Weights of the reward terms of ``reward_fn`` by name, and of any terms of the environment: ``split``, a
+            penalty for a torn robot where there is a ``split_limit``, see
+            :meth:`dittogym.rewards.RewardOps.split_penalty`; ``action``, minus the sum over both muscle directions of
+            the Frobenius norm of the actuation on the patch, Pa; and ``alive``, 1 in every step.
         objects: Bodies besides the robot, at most one.
-        gravity: (x, y), m/s^2.
-        damping: Factor on node velocities in every 1e-4 s.
-        window: Fixed or moving window.
-        view: Centre (x, y) of the observed region, half a metre wide, in the window, m; ``None`` for a coordinate that
-            follows the robot.
+        lam: First Lame parameter of the robot, and of an object without a material of its own, Pa.
+        gravity: Acceleration (x, y), m/s^2.
+        damping: Factor on node velocities in every 1e-4 s; 1 is no damping.
+        window: Where the simulated window lies, and whether it follows the robot.
+        view: Centre (x, y) of the observed region, which is half a metre wide, relative to the lower left corner of the
+            window, m, from 0 to 1; ``None`` for a coordinate that follows the robot.
         patch_centre: Centre (x, y) of the action patch, in the same form.
-        patch: Width of the action patch in nodes.
-        obstacles: Static geometry, in order of precedence.
-        goal: Point (x, y) in the world, m, drawn in the observation as a square 2 cm wide; ``None``: no goal.
-        coarse, fine: Action resolutions.
-        split_limit: The robot's radius of gyration at which it counts as torn and the episode ends, m; ``None``: it
-            never does.
-        initial_task_state: What to remember from the start of an episode, tensors with a leading B.
-        target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; renderings of the task show it.
+        patch: P, width of the action patch in nodes, from 4 to 128.
+        obstacles: Static geometry; of several obstacles that forbid one direction of motion at a node, the first
+            counts.
+        goal: Point (x, y) in the world, m, drawn in the observation as a square 2 cm wide; ``None`` for no goal.
+        coarse: R of the resolution ``"coarse"``, at most ``fine``.
+        fine: R of the resolution ``"fine"``, at most ``patch``.
+        split_limit: Radius of gyration above which the robot counts as torn and the episode ends, m; ``None`` for no
+            limit.
+        initial_task_state: A function that takes a :class:`dittogym.Transition` and this specification right after a
+            reset, and returns what the task is to remember, tensors by name with a leading B.
+        target: (64, 64) bool picture to match, centred on the robot, row 0 at the top, which pictures of the task show;
+            ``None`` for none.
 
     Raises:
-        ValueError: A number is out of range, or there is more than one object.
+        ValueError: A number is out of range, there is more than one object, or ``target`` is another kind of array.
         TypeError: A value has another type, or a function cannot be called.
     """
 
@@ -170,12 +184,12 @@ class TaskSpec:
 
     @property
     def bodies(self) -> tuple[BodySpec, ...]:
-        """Robot and objects in particle order."""
+        """The robot and the objects, in the order of their particles."""
         return (self.robot, *self.objects)
 
     @property
     def starts_alike(self) -> bool:
-        """Whether particles start in the same places whatever the seed, as in GROW and OBSTACLE."""
+        """Whether particles start in the same places with every seed, as in GROW and OBSTACLE."""
         return not any(body.shape.draws for body in self.bodies)
 
     @property

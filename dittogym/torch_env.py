@@ -42,34 +42,53 @@ RESET_OPTIONS = ("physics", "positions", "reset_mask")
 class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
-    Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. The
-    observation is an integer image without gradient, unless :meth:`step` is called with ``soft=True``. Elements are not
-    reset automatically: one that has ended goes on until :meth:`reset`. Element i of a batch reset with seed s is the
-    single environment reset with seed s + i.
+    An observation is an image (3, 64, 64) of the half metre around the robot, row 0 at the top: occupancy, and velocity
+    to the right and upwards. It is an integer image without gradient, unless :meth:`step` is called with ``soft=True``.
+    Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. Elements of
+    the batch are not reset automatically: one whose episode has ended goes on until :meth:`reset`. Element i of a batch
+    that is reset with seed s equals a single environment that is reset with seed s + i.
+
+    Before the first :meth:`reset` there is no state, and what needs one raises a RuntimeError.
 
     Args:
-        task: A task name or a :class:`dittogym.spec.TaskSpec`.
+        task: A task name, ``"MODULE:NAME"``, or a :class:`dittogym.TaskSpec`.
         num_envs: B, the number of simulations.
-        resolution: ``"coarse"``, ``"fine"``, or R itself, at most the task's patch.
-        particles: ``"full"``, ``"lite"`` (2,000, evenly spread), the robot's number, or (robot, object).
-        substeps: Substeps in a control step; ``None``: as many as take 10 ms.
+        resolution: R, rows and columns of an action: ``"coarse"`` or ``"fine"``, which are numbers of the task, or a
+            number from 1 to ``TaskSpec.patch``.
+        particles: ``"full"``, the paper's number; ``"lite"``, about 2,000 evenly spread ones; the number of the robot's
+            particles, to which that of an object is in proportion; or the numbers (robot, object).
+        substeps: Substeps in a control step; ``None`` stands for as many as take 10 ms.
         dt: Duration of a substep, s. The task's damping per second stays the same.
-        dtype: ``"float32"`` or ``"float64"``, by name or as torch's.
-        device: Where it runs.
-        backend: Of the solver, see :class:`torchmpm.Solver`.
-        action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
-            ``"grid"``: (x, y), as in the reference implementation. ``None`` stands for ``"image"``.
+        dtype: Precision of the physics: ``"float32"`` or ``"float64"``, or torch's dtypes.
+        device: ``"cpu"`` or ``"cuda"``, or torch's devices.
+        backend: Backend of the solver, ``"auto"``, ``"native"`` or ``"eager"``, see :class:`torchmpm.Solver`.
+        action_layout: With ``"image"`` an action pixel (row, column) acts where that pixel of the observation looks;
+            with ``"grid"``, as in the reference implementation, the indices are (x, y), to the right and upwards.
+            ``None`` stands for ``"image"``.
         resample: Draw new particles at every reset, not only at a seeded one; no effect where
             ``TaskSpec.starts_alike``.
-        deterministic: Refuse what does not repeat bit by bit: CUDA.
+        deterministic: Accept only what repeats bit by bit, gradients included, which excludes CUDA.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
-        conditions: From which ranges each episode draws its start, the constants of its matter and its disturbances;
-            ``None``: all are the task's own.
+        conditions: Ranges from which each episode draws its start, the constants of its matter and its disturbances, a
+            :class:`dittogym.Conditions` or a mapping with its fields; ``None``: all are the task's own.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
+    Attributes:
+        spec: The task, a :class:`dittogym.TaskSpec`.
+        num_envs: B, the number of simulations.
+        observation_shape: (3, 64, 64).
+        action_shape: (2, R, R).
+        action_resolution: R, rows and columns of an action.
+        action_layout: ``"image"`` or ``"grid"``.
+        dtype: Precision of the physics, as torch's dtype.
+        device: Where it runs, as torch's device.
+        conditions: The :class:`dittogym.Conditions`, or ``None``.
+        model: The :class:`dittogym.core.Model`, for the functions of :mod:`dittogym.core`.
+
     Raises:
-        ValueError: An argument is out of range, or the task's functions return what they must not.
+        ValueError: An argument is out of range, the matter is not stable, or the task's functions return what they must
+            not.
         TypeError: The task has no such option, or its functions return something of another kind.
 
     Examples:
@@ -148,17 +167,20 @@ class TorchEnv:
 
     @property
     def num_particles(self) -> int:
-        """N, particles of all bodies."""
+        """N, the number of particles of all bodies."""
         return self.model.solver.num_particles
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.core`. Assign a state to continue from it.
+        """Everything that moves, for the functions of :mod:`dittogym.core`; assign a state to continue from it.
 
-        An environment without conditions leaves those of the state out; one with conditions needs them.
+        An environment without conditions ignores those of an assigned state; one with conditions needs them.
 
         Raises:
-            RuntimeError: It was neither reset nor assigned.
+            RuntimeError: The environment was not reset yet; or, on assignment, a transform of ``torch.func`` is active.
+            TypeError: On assignment: the value is not a :class:`dittogym.core.EnvState`.
+            ValueError: On assignment: the state has other sizes, another dtype or device, or lacks the task's state or
+                conditions.
         """
         if self._env_state is None:
             raise RuntimeError("call reset() first: the environment has no state yet")
@@ -189,7 +211,13 @@ class TorchEnv:
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
-        """States of the random generators that ``resample`` draws from, ``key`` (624,) and ``pos`` (); can be set."""
+        """States of the random generators that draw positions, by element; assign them to restore a training.
+
+        Each is that of a Mersenne Twister: ``key`` (624,) and ``pos`` ().
+
+        Raises:
+            RuntimeError: On assignment: an element has no generator yet, as it was not reset.
+        """
         return {element: get_state(each) for element, each in self._initial_positions.generators.items()}
 
     @generators.setter
@@ -206,7 +234,7 @@ class TorchEnv:
         return self.env_state.particles
 
     def observation(self) -> Tensor:
-        """The last image (B, 3, 64, 64) uint8, computed again if the state was assigned; do not write to it."""
+        """Return the last observation (B, 3, 64, 64) uint8, drawn anew if a state was assigned; do not write to it."""
         if self._observation is None:
             self._observation = self._seen(core.observe(self.model, self.env_state), self.env_state)
         return self._observation
@@ -218,7 +246,7 @@ class TorchEnv:
         return varied.seen(state.conditions, state.steps, image)
 
     def detach(self) -> None:
-        """Detach the state, and the physics of the last reset, from the autograd graph."""
+        """Detach the state, including the constants of the last reset, from the autograd graph."""
         self._env_state = tree.detach(self.env_state)
 
     def save(self) -> Snapshot:
@@ -233,20 +261,24 @@ class TorchEnv:
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Restore a snapshot; the simulation continues bit for bit as it did before.
 
-        Positions and physics of the next reset, a ``TimeLimit``'s count, and learned materials are not part of it. What
-        the next episodes draw as conditions is: elements that were loaded with the same one draw alike until a seeded
-        reset.
+        Not part of a snapshot are the positions and constants that the next reset uses, the count of a Gymnasium
+        ``TimeLimit``, and the values of learned materials. The random numbers of conditions are part of it: elements
+        that were loaded from the same simulation draw the same conditions until a seeded reset.
 
         Args:
-            snapshot: Of this environment or one like it; one of a single simulation goes into every element.
-            mask: (B,) bool, load only these elements.
+            snapshot: A snapshot of this environment or of one with the same options. That of a single simulation is
+                loaded into every element.
+            mask: (B,) bool, true for the elements to load; ``None`` loads all.
 
         Returns:
-            The observation (B, 3, 64, 64) uint8.
+            The observation (B, 3, 64, 64) uint8 of all elements.
 
         Raises:
             ValueError: The snapshot is of another task or variant, other numbers of particles, other substeps, another
-                type, device or batch size, or without the conditions that this environment has.
+                type, device or batch size, or lacks the conditions that this environment has; or ``mask`` is not (B,)
+                bool.
+            TypeError: ``snapshot`` is not a :class:`dittogym.snapshots.Snapshot`.
+            RuntimeError: ``mask`` leaves elements out, and the environment was not reset yet.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs)
@@ -273,21 +305,27 @@ class TorchEnv:
         """Start new episodes. A reset that raises an error changes nothing.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
-                where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
-                Conditions are drawn in either case; those of a seed are always the same.
-            options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
-                ``resample`` until the next reset; particles keep their masses and volumes at rest. ``"physics"``:
-                constants of the matter, see :func:`dittogym.physics.physics_values`, used until given again, ``{}``
-                goes back to the task's own; ``"reset_mask"``: (B,) bool, reset only these elements; in an array, a GPU
-                need not be waited for. Later resets reuse values without gradients.
+            seed: A number from 0 to 2**32 - 1 seeds element i with ``seed + i``, a sequence seeds it with ``seed[i]``;
+                a seeded element draws new positions. Without a seed, or where ``seed[i]`` is ``None``, an element uses
+                its last positions again, unless the environment was made with ``resample=True``. Conditions are drawn
+                in either case; those of a seed are always the same.
+            options: A mapping that may hold three entries. ``"positions"``: initial positions (N, 2) or (B, N, 2) in
+                the world, m, robot first, used until the next seed, with ``resample`` until the next reset; particles
+                keep their masses and undeformed volumes. ``"physics"``: constants of the matter, see ``given`` of
+                :func:`dittogym.physics.physics_values`, used until a reset gives others; ``{}`` stands for the task's
+                own. ``"reset_mask"``: (B,) bool, true for the elements to reset; as a NumPy array it does not have to
+                be copied from a GPU. Gradients in positions and constants reach back to this reset; later resets use
+                their values without gradients.
 
         Returns:
-            The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
+            The observation (B, 3, 64, 64) uint8 of all elements, and ``info`` with ``com``, ``split``, ``finite`` and,
+            in tasks with an object, ``object_com``, as :meth:`step` returns them.
 
         Raises:
-            ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
-                too stiff for the substeps; or, on a GPU, a step since the last reset got an action that is not finite.
+            ValueError: A seed is out of range; an option is unknown, has the wrong shape, puts particles outside the
+                window, or makes matter too stiff for the substeps; the first reset leaves elements out; or, on a GPU, a
+                step since the last reset got an action that is not finite.
+            RuntimeError: A transform of ``torch.func`` or a trace of ``make_fx`` is active.
         """
         _refuse_transforms("TorchEnv.reset")
         options = reset_options(options)
@@ -362,25 +400,30 @@ class TorchEnv:
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
 
-        On a GPU it returns before the step is done, and does not wait for what only the device knows: an action that is
-        not finite ends its element with :data:`dittogym.core.FAILURE_REWARD`, and the next reset, of any elements,
-        raises the error. Without gradients, the third step is recorded as a CUDA graph, which later steps replay; the
-        task's reward function is not part of it.
+        On a GPU this returns before the step is done, and does not wait for what only the device knows: an action that
+        is not finite ends its episode with the reward :data:`dittogym.core.FAILURE_REWARD`, and the next reset, of any
+        elements, raises the error. Without gradients, the third step is recorded as a CUDA graph, which later steps
+        replay; the task's reward function is not part of it.
 
         Args:
-            action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
-                beyond [-1, 1] saturate after the interpolation.
-            soft: Observation and reward are the smooth ones, for gradients; ``info["true_reward"]`` is the reward.
+            action: (B, 2, R, R) floating point, muscle stress as a fraction of the task's largest, from -1, expansion,
+                to 1, contraction; ``[:, 0]`` along material x and ``[:, 1]`` along material y. Values beyond [-1, 1]
+                saturate after the interpolation to the grid.
+            soft: Return the smooth observation and reward, for gradients; ``info["true_reward"]`` is then the reward.
 
         Returns:
-            observation (B, 3, 64, 64) uint8, floating point and differentiable with ``soft``; reward (B,); terminated
-            (B,) bool; truncated (B,) bool, at the horizon; and, all with a leading B, ``info``: ``reward_terms`` by
-            name, ``com``, ``split``, ``finite`` (false outside the simulation window, too), ``is_success`` where the
-            task defines it, and the task's own quantities.
+            Five values. The observation (B, 3, 64, 64) uint8; with ``soft`` in floating point, from 0 to 255 and
+            differentiable. The reward (B,). Whether the task ended the episode, ``terminated`` (B,) bool. Whether the
+            horizon is reached, ``truncated`` (B,) bool. And ``info`` with a leading B throughout: ``reward_terms``,
+            the weighted terms of the reward by name, (B,) each; ``com`` (B, 2), the robot's centre of mass, m;
+            ``split`` (B,), its radius of gyration, m; ``finite`` (B,) bool, false if a number is not finite or all of
+            the robot is outside the window; ``object_com`` (B, 2), m, in tasks with an object; ``is_success`` (B,) bool
+            in tasks that define it; and the task's own quantities.
 
         Raises:
             ValueError: The action has the wrong shape or type or, on the CPU, is not finite.
-            RuntimeError: It is called under a transform of ``torch.func`` or in a backward pass.
+            RuntimeError: The environment was not reset yet, or this is called under a transform of ``torch.func`` or in
+                a backward pass.
         """
         _refuse_transforms("TorchEnv.step")
         if torch._C._current_graph_task_id() != -1:
@@ -434,36 +477,58 @@ class TorchEnv:
             raise ValueError("action must be finite, got NaN or infinite entries in a step since the last reset")
 
     def soft_observation(self) -> Tensor:
-        """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
+        """Return the smooth observation (B, 3, 64, 64) of the present state, from 0 to 255 in floating point.
+
+        See :func:`dittogym.core.soft_observation`.
+        """
         return self._seen(core.soft_observation(self.model, self.env_state), self.env_state)
 
     def shot(self, index: int = 0, quantities: Sequence[str] = QUANTITIES) -> Shot:
-        """What pictures show of the present moment of one simulation, ``index``, with these quantities alone."""
+        """Return what pictures show of the present moment of one simulation.
+
+        Args:
+            index: Element of the batch.
+            quantities: Which quantities of the particles to compute: any of ``"muscle"``, ``"deformation"`` and
+                ``"speed"``, see :class:`dittogym.render.scene.Shot`.
+
+        Raises:
+            IndexError: There is no such element.
+            KeyError: There is no such quantity.
+        """
         return take(self.model, self.env_state, index, self._actuation, quantities)
 
     def render(self, index: int = 0, *, muscles: bool = True, size: int = 512, zoom: float | None = None) -> np.ndarray:
-        """Picture (S, S, 3) uint8 of one simulation in RGB.
+        """Draw one simulation.
 
         Args:
-            index: Which element of the batch.
+            index: Element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
-            size: S, pixels per side.
-            zoom: The picture shows 1 / zoom metres, 1 is the whole window; ``None``: 0.56 m, a little more than the
-                robot observes.
+            size: S, pixels per side, from 16 to 8192.
+            zoom: The picture shows ``1 / zoom`` metres, so that 1 is the whole window, and at most 20 m; ``None``
+                stands for 0.56 m, a little more than the robot observes.
+
+        Returns:
+            A picture (S, S, 3) uint8 in RGB.
+
+        Raises:
+            IndexError: There is no such element.
+            ValueError: ``size`` or ``zoom`` is out of range, or ``muscles`` is not True or False.
         """
         return frame(describe(self.model), self.shot(index, ("muscle",)), size, zoom, muscles)
 
     def film(
         self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: Seed = 0, index: int = 0, **options: Any
     ) -> Recording:
-        """Reset, play an episode, and record one of the simulations until its episode ends.
+        """Reset the environment, play an episode, and record one of the simulations until its episode ends.
 
         Args:
-            policy: A function from observations (B, 3, 64, 64) uint8, NumPy, to actions (B, 2, R, R), or an object with
-                such a method ``predict``, as :func:`cfp.load` returns it.
-            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Seed of the reset and, if it is not ``None``, of the policy's noise.
-            index: Which element of the batch.
+            policy: A function from observations, a NumPy array (B, 3, 64, 64) uint8, to actions (B, 2, R, R); or an
+                object with the method ``predict(observation, state)`` of stable-baselines3, which returns actions and
+                the next state, such as :func:`cfp.load` returns.
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write;
+                ``None`` writes nothing.
+            seed: Seed of the reset and, unless it is ``None``, of the policy's noise.
+            index: Element of the batch.
             options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
                 and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
 
@@ -471,8 +536,19 @@ class TorchEnv:
             The recording, from which further films can be saved. A notebook shows it.
 
         Raises:
-            ValueError: An option is out of range, the file does not take it, or the policy has another layout.
-            TypeError: The policy is neither a function nor has a method ``predict``.
+            ValueError: An option is out of range, the file does not take it, ``path`` has another suffix, the policy
+                returns no actions, or it was trained with another ``action_layout``.
+            TypeError: The policy is neither a function nor has a method ``predict``, there is no such option, or
+                options of a file are given without ``path``.
+            IndexError: There is no such element.
+            dittogym.render.film.VideoUnavailable: An MP4 without the extra ``video``, or with an ffmpeg that fails.
+
+        Examples:
+            >>> import dittogym, numpy as np
+            >>> env = dittogym.TorchEnv("run", particles=300, substeps=10)
+            >>> recording = env.film(lambda observation: np.zeros((1, 2, 8, 8)), seed=0, max_steps=5)
+            >>> len(recording.rewards)  # recording.save("run.webp") writes a film
+            5
         """
         return film(self, as_function(policy, self), path, seed, index, **options)
 

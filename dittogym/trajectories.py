@@ -1,4 +1,7 @@
-"""Episodes as arrays, to learn from: recording them, and files of them, NumPy archives and Minari datasets."""
+"""Episodes as arrays, to learn from: recording them, and storing them in NumPy archives and Minari datasets.
+
+Import the module by its name, ``from dittogym import trajectories``.
+"""
 
 from __future__ import annotations
 
@@ -40,15 +43,16 @@ class Episode:
 
     Attributes:
         observations: (T + 1, 3, 64, 64) uint8, from the reset to the end.
-        actions: (T, 2, R, R), as the policy chose them; what exceeds [-1, 1] is cut off after they are enlarged.
-        rewards: (T,).
-        terminations: (T,) bool, whether the task ended the episode.
-        truncations: (T,) bool, whether a time limit ended it.
-        particles: Of the states, by name: ``x`` (T + 1, N, 2) in m, ``v`` (T + 1, N, 2) in m/s, and others on request.
+        actions: (T, 2, R, R), as the policy chose them; they saturate at [-1, 1] after their interpolation.
+        rewards: (T,) float64.
+        terminations: (T,) bool, whether the task ended the episode in this step.
+        truncations: (T,) bool, whether a time limit ended the episode in this step.
+        particles: Fields of :class:`torchmpm.ParticleState` at the reset and after each step, by name: ``x``
+            (T + 1, N, 2), m, ``v`` (T + 1, N, 2), m/s, and others on request.
         seed: Seed of the reset.
         task: Name of the task.
-        environment: Options of the environment, as JSON values. A robot and obstacles of one's own are not among them,
-            and of ``options["physics"]`` in effect only the names.
+        environment: Options of the environment, as JSON values. Custom robots and obstacles are not among them, and of
+            the constants that ``options["physics"]`` set, only the names are.
     """
 
     observations: np.ndarray
@@ -71,18 +75,27 @@ def record(
     kind of processor.
 
     Args:
-        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package, with a time
-            limit if you like, but without other wrappers, which would have no part in it.
-        policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
-        seed: Seed of the reset and of the policy's noise.
-        fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
-        max_steps: Truncate a longer episode after so many steps; ``None``: the time limit of ``env``, at most the
+        env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package. Gymnasium's
+            time limit may wrap it; other wrappers are refused, as they would have no effect.
+        policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`,
+            or, for a Gymnasium environment, :meth:`dittogym.Env.film`.
+        seed: Seed of the reset and of the policy's noise, from 0 to 2**32 - 1.
+        fields: Which fields of the particles to keep: any of ``"x"``, ``"v"``, ``"C"``, ``"F"`` and ``"Jp"``.
+        max_steps: Truncate a longer episode after so many steps; ``None`` for the time limit of ``env``, at most the
             task's horizon.
 
     Raises:
         TypeError: The environment, the policy or ``fields`` is of another kind.
-        ValueError: The environment has more than one simulation, or wrappers, there is no such field, or ``max_steps``
-            is no whole number from 1.
+        ValueError: The environment has more than one simulation or other wrappers, there is no such field, ``seed`` or
+            ``max_steps`` is out of range, or the policy returns something else than actions.
+
+    Examples:
+        >>> import dittogym, numpy as np
+        >>> from dittogym import trajectories
+        >>> env = dittogym.TorchEnv("run", particles=300, substeps=10)
+        >>> episode = trajectories.record(env, lambda observation: np.zeros((1, 2, 8, 8)), seed=0, max_steps=5)
+        >>> episode.observations.shape, episode.particles["x"].shape
+        ((6, 3, 64, 64), (6, 300, 2))
     """
     seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
@@ -129,14 +142,17 @@ def _options(env: TorchEnv) -> dict[str, Any]:
 
 
 def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> Path:
-    """Write episodes to a compressed NumPy archive, and return its path.
+    """Write episodes to a compressed NumPy archive.
 
-    The archive holds of each episode i arrays such as ``i/actions`` and ``i/particles/x``, and a JSON string ``about``
-    with seeds, tasks and options of the environments.
+    The archive holds arrays such as ``i/actions`` and ``i/particles/x`` for each episode i, and a JSON string ``about``
+    with the seeds, tasks and options of the environments.
 
     Args:
-        path: A file ``.npz``.
-        episodes: At least one.
+        path: A file whose name ends in ``.npz``.
+        episodes: One or more episodes.
+
+    Returns:
+        The path.
 
     Raises:
         ValueError: The file has another suffix, or there is no episode.
@@ -160,13 +176,16 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
 
 
 def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
-    """Read what :func:`save_episodes` wrote; nothing is unpickled.
+    """Read the episodes that :func:`save_episodes` wrote; nothing is unpickled.
 
     Args:
         path: The file.
 
+    Returns:
+        The episodes.
+
     Raises:
-        ValueError: It is damaged, or not such a file.
+        ValueError: The file is damaged, or not such a file.
         FileNotFoundError: There is no such file.
     """
     try:
@@ -195,9 +214,10 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
     """Write episodes as a Minari dataset (HDF5), in which the particles are ``infos``. Needs the extra ``minari``.
 
     Args:
-        dataset_id: Such as ``"dittogym/run/cfp-v0"``; Minari keeps it below ``MINARI_DATASETS_PATH``.
-        episodes: At least one.
-        env: The Gymnasium environment that they are of, which Minari makes anew from its specification.
+        dataset_id: Name of the dataset, such as ``"dittogym/run/cfp-v0"``; Minari keeps it in the folder that the
+            environment variable ``MINARI_DATASETS_PATH`` names.
+        episodes: One or more episodes.
+        env: The Gymnasium environment of the episodes, whose specification the dataset stores.
         metadata: Further arguments of ``minari.create_dataset_from_buffers``, such as ``algorithm_name``.
 
     Returns:
@@ -240,7 +260,18 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
 
 
 def load_minari(dataset_id: str) -> list[Episode]:
-    """Read what :func:`save_minari` wrote: the dataset ``dataset_id``. Needs the extra ``minari``."""
+    """Read the episodes of a Minari dataset that :func:`save_minari` wrote. Needs the extra ``minari``.
+
+    Args:
+        dataset_id: Name of the dataset.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        ImportError: Minari or h5py is not installed.
+        FileNotFoundError: There is no such dataset.
+    """
     dataset = _minari().load_dataset(dataset_id)
     seeds = [about["seed"] for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
     about = dataset.storage.metadata

@@ -56,20 +56,29 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` simulations behind Gymnasium's vector interface.
 
     Args:
-        task: Task name or specification.
-        num_envs: Number of simulations.
-        autoreset_mode: ``NEXT_STEP`` (an ended episode is reset in the next call, whose action it ignores; what
-            Gymnasium's vector wrappers need), ``SAME_STEP`` (in the same call; ``info["final_obs"]`` and
-            ``info["final_info"]`` are the last ones), or ``DISABLED``.
-        render_mode: ``None`` or ``"rgb_array"``.
+        task: A task name, ``"MODULE:NAME"``, or a :class:`dittogym.TaskSpec`.
+        num_envs: B, the number of simulations.
+        autoreset_mode: A ``gymnasium.vector.AutoresetMode`` or its value. With ``NEXT_STEP`` (``"NextStep"``), which
+            Gymnasium's vector wrappers need, an episode that has ended is reset by the next call of :meth:`step`, which
+            ignores its action. With ``SAME_STEP`` (``"SameStep"``) it is reset by the same call, and the last
+            observation and info are ``info["final_obs"]`` and ``info["final_info"]``. With ``DISABLED``
+            (``"Disabled"``) it goes on until :meth:`reset`.
+        render_mode: ``None``, or ``"rgb_array"`` for :meth:`render`.
         render_muscles: Colour the robots by their muscles in pictures.
-        render_size: Pixels per side of pictures.
-        max_episode_steps: Horizon instead of the task's; -1: unlimited. That of the id, which Gymnasium passes where
-            none is given, stands for the task's with its options.
+        render_size: Pixels per side of pictures, from 16 to 8192.
+        max_episode_steps: Control steps after which episodes are truncated; -1 for no limit, ``None`` for the task's
+            horizon. The horizon that the task has without options, which Gymnasium passes if none is given, stands for
+            the horizon with them.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
+    Attributes:
+        torch_env: The :class:`dittogym.TorchEnv` behind it.
+        single_observation_space: ``Box(0, 255, (3, 64, 64), uint8)``; ``observation_space`` has a leading B.
+        single_action_space: ``Box(-1, 1, (2, R, R), float32)``; ``action_space`` has a leading B.
+
     Raises:
-        ValueError: Unknown mode, or as in :class:`dittogym.TorchEnv`.
+        ValueError: A mode is unknown, ``max_episode_steps`` is out of range, or as in :class:`dittogym.TorchEnv`.
+        TypeError: As in :class:`dittogym.TorchEnv`.
 
     Examples:
         >>> import dittogym, gymnasium
@@ -116,14 +125,15 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @torch.no_grad()
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
+        """Start new episodes, see :meth:`dittogym.TorchEnv.reset`, whose errors it raises.
 
         Args:
-            seed: Seed from which new initial positions are drawn, of element i ``seed + i`` or ``seed[i]``.
-            options: The options of :meth:`dittogym.TorchEnv.reset`.
+            seed: Seed from which new initial positions are drawn: element i has the seed ``seed + i`` or ``seed[i]``.
+            options: The options of :meth:`dittogym.TorchEnv.reset`, such as ``"reset_mask"``.
 
         Returns:
-            The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
+            The observations (B, 3, 64, 64) uint8 of all elements, and ``info`` in Gymnasium's form, in which a mask
+            ``_name`` (B,) bool beside the entry ``name`` says for which elements it holds.
         """
         observation, info = self.torch_env.reset(seed=seed, options=options)
         first_seed = seed[0] if isinstance(seed, Sequence | np.ndarray) else seed
@@ -133,14 +143,19 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all simulations; see :meth:`dittogym.TorchEnv.step`.
+        """Advance all simulations by one control step, see :meth:`dittogym.TorchEnv.step`.
 
         Args:
-            actions: (B, 2, R, R) in [-1, 1].
+            actions: (B, 2, R, R) numbers in [-1, 1]; larger ones saturate.
 
         Returns:
-            Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, and ``info``
-            with arrays; the reward terms have keys such as ``"reward_terms/velocity"``.
+            The observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminations (B,) bool, truncations (B,) bool,
+            and ``info`` with the entries of :meth:`dittogym.TorchEnv.step` as arrays, in the form that :meth:`reset`
+            describes; the reward terms have keys such as ``"reward_terms/velocity"``.
+
+        Raises:
+            ValueError: The actions have another shape or are not finite.
+            RuntimeError: The environment was not reset yet.
         """
         action = as_tensor(actions, self.torch_env)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
@@ -172,11 +187,13 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
-        """Restore a snapshot; an element that was to be reset continues instead.
+        """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`, whose errors it raises.
+
+        An element that was to be reset by the next step continues from the snapshot instead.
 
         Args:
-            snapshot: As in :meth:`dittogym.TorchEnv.load`.
-            mask: (B,) bool, load only these elements.
+            snapshot: What :meth:`save` returned here, or in an environment with the same options.
+            mask: (B,) bool, true for the elements to load; ``None`` loads all.
 
         Returns:
             The observations (B, 3, 64, 64) uint8 of all elements.
@@ -186,7 +203,10 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return as_numpy(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture (S, S, 3) uint8 of ``render_size`` S of each simulation in mode ``"rgb_array"``, else nothing."""
+        """Return a picture (S, S, 3) uint8 in RGB of each simulation in mode ``"rgb_array"``, else ``None``.
+
+        S is the ``render_size``.
+        """
         return None if self.render_mode is None else tuple(map(self._picture, range(self.num_envs)))
 
 

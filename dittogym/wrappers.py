@@ -18,13 +18,17 @@ AnyEnv = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
 def action_resolution(env: AnyEnv, size: int) -> Any:
-    """Actions of (2, size, size), enlarged to the resolution of ``env`` by bicubic interpolation.
+    """Wrap an environment so that it takes coarser actions, which are enlarged by bicubic interpolation.
 
-    The option ``resolution=size`` of :func:`gymnasium.make` enlarges them in one step with the physics instead.
+    For an environment that is still to be made, use the option ``resolution=size`` of :func:`gymnasium.make`, with
+    which actions are interpolated to the nodes of the grid only once.
 
     Args:
         env: A single or a vector environment of Gymnasium.
         size: Rows and columns of the new actions, at most those of the actions of ``env``.
+
+    Returns:
+        The wrapped environment, with actions (..., 2, size, size).
 
     Raises:
         ValueError: ``size`` is not a whole number in this range.
@@ -39,11 +43,14 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
 
 
 def observation_resolution(env: AnyEnv, size: int) -> Any:
-    """Observations of (..., 3, size, size), reduced by averaging over areas.
+    """Wrap an environment so that it returns coarser observations, averaged over areas.
 
     Args:
         env: A single or a vector environment of Gymnasium.
         size: Rows and columns of the new observations, at most those of the observations of ``env``.
+
+    Returns:
+        The wrapped environment, with observations (..., 3, size, size).
 
     Raises:
         ValueError: ``size`` is not a whole number in this range.

@@ -22,21 +22,29 @@ SMALLEST_PART = 0.02
 
 
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
-    """The task with another robot.
+    """Return a task with another robot, as the option ``body`` of environments does.
 
-    Pictures and outlines keep the area, particles and mass of the task's own robot, and stand where it stood: same
-    centre in x, same lowest point. With thicker lines they take less room. A shape lies where it says, and is filled as
-    densely: a picture of another size is a :class:`dittogym.bodies.shapes.Figure`. A body is taken as it is.
+    A picture or an outline is scaled to the area of the task's own robot, has as many particles and as much mass, and
+    is put in its place, with the same centre in x and the same lowest point. If it does not fit there, draw it with
+    thicker lines, with which it takes less room.
+
+    What is drawn in a picture are its opaque pixels if there are transparent ones; otherwise its bright pixels, or, if
+    all four corners are bright, its dark ones. In a Boolean array, true pixels are drawn. The order of the colours, RGB
+    or BGR, does not matter.
 
     Args:
         spec: The task.
-        body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), read by
-            :func:`dittogym.bodies.images.read_mask`; corners (K, 2) of an outline with x to the right and y upwards, in
-            any unit; a shape of :mod:`dittogym.bodies.shapes` in world coordinates; or a
-            :class:`dittogym.spec.BodySpec`.
+        body: A picture, as the path of an image file or as an array (H, W), (H, W, 3) or (H, W, 4) of bool, uint8,
+            uint16, or floating point from 0 to 1; an outline, as corners (K, 2) with x to the right and y upwards, in
+            any unit; a shape of :mod:`dittogym.bodies.shapes`, which stays where it is, in metres, and is filled as
+            densely as the task's own robot; or a :class:`dittogym.spec.BodySpec`, which is taken as it is. A picture
+            that is to keep its size is a :class:`dittogym.bodies.shapes.Figure`.
+
+    Returns:
+        A specification with ``body`` as its robot. It warns if a drawing consists of separate parts.
 
     Raises:
-        ValueError: Not readable as one of these, or empty.
+        ValueError: ``body`` is nothing of these, cannot be read, or is empty.
     """
     own = spec.robot
     if isinstance(body, Shape):

@@ -14,11 +14,15 @@ from torchmpm.sampling import Points
 
 @runtime_checkable
 class Shape(Protocol):
-    """Where the particles of a body start."""
+    """Interface of a shape: any object with these members says where the particles of a body start."""
 
     @property
     def draws(self) -> int:
-        """Uniform numbers per particle in the reference: 4 (a magnitude and a sign a coordinate), 2, or 0 (lattice)."""
+        """How many uniform numbers the reference implementation draws for a particle; 0 if all starts are alike.
+
+        With 2, these are the two coordinates. With 4, they are the magnitudes and the signs of two coordinates that are
+        counted from the centre.
+        """
 
     @property
     def corner(self) -> tuple[float, float]:
@@ -30,19 +34,29 @@ class Shape(Protocol):
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m from N points of the unit square (N, 2)."""
+        """Return the positions of N particles.
+
+        Args:
+            numbers: (N, 2) numbers from 0 to 1; a lattice uses N alone.
+
+        Returns:
+            (N, 2) positions in the world, m, within the bounding box.
+        """
 
 
 @dataclass(frozen=True)
 class Disc:
-    """Disc with the chord density of the reference.
+    """A disc with the density of the reference implementation, see :func:`torchmpm.sampling.chord_disc`.
 
     Attributes:
-        corner: Lower left corner of the bounding square in the world, m.
-        diameter: m.
+        corner: Lower left corner (x, y) of the bounding square in the world, m.
+        diameter: Diameter, m.
+
+    Raises:
+        ValueError: ``corner`` is not two numbers, or ``diameter`` is not positive.
     """
 
     corner: tuple[float, float]
@@ -60,23 +74,26 @@ class Disc:
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return 0.25 * math.pi * self.diameter**2
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m."""
+        """Return positions in the world, (N, 2), m, from ``numbers`` (N, 2) from 0 to 1."""
         radius = 0.5 * self.diameter
         return sampling.chord_disc(numbers, (self.corner[0] + radius, self.corner[1] + radius), radius)
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Box of uniform density.
+    """A box of uniform density.
 
     Attributes:
-        corner: Lower left corner in the world, m.
+        corner: Lower left corner (x, y) in the world, m.
         size: Width and height, m.
-        draws: See :class:`Shape`; 2 or 4.
+        draws: 2 or 4, see :attr:`Shape.draws`.
+
+    Raises:
+        ValueError: ``corner`` is not two numbers, ``size`` is not two positive numbers, or ``draws`` is another number.
     """
 
     allowed_draws: ClassVar[tuple[int, ...]] = (2, 4)
@@ -93,23 +110,31 @@ class Rectangle:
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return self.size[0] * self.size[1]
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m."""
+        """Return positions in the world, (N, 2), m, from ``numbers`` (N, 2) from 0 to 1."""
         return sampling.box(numbers, self.corner, self.size)
 
 
 @dataclass(frozen=True)
 class Lattice(Rectangle):
-    """Box with evenly spaced particles in rows from the bottom up, without any randomness."""
+    """A box with evenly spaced particles, the same with every seed.
+
+    They lie in rows from the bottom up, whose numbers of particles differ by at most one.
+
+    Attributes:
+        corner: Lower left corner (x, y) in the world, m.
+        size: Width and height, m.
+        draws: Always 0, see :attr:`Shape.draws`.
+    """
 
     allowed_draws: ClassVar[tuple[int, ...]] = (0,)
     draws: int = field(default=0, kw_only=True)
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m, in rows that differ by at most one particle."""
+        """Return positions in the world, (N, 2), m; of ``numbers`` (N, 2) only N matters."""
         count = len(numbers)
         rows = max(1, round(math.sqrt(count * self.size[1] / self.size[0])))
         rank = np.arange(count)
@@ -121,11 +146,11 @@ class Lattice(Rectangle):
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """The set pixels of a mask, with uniform density.
+    """The true pixels of a mask, with uniform density.
 
     Attributes:
         mask: (rows, columns) bool, row 0 at the top, without empty rows or columns at the edges.
-        corner: Lower left corner in the world, m.
+        corner: Lower left corner (x, y) in the world, m.
         pixel: Side of a pixel, m.
 
     Raises:
@@ -155,9 +180,9 @@ class Figure:
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return float(self.mask.sum()) * self.pixel**2
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m."""
+        """Return positions in the world, (N, 2), m, from ``numbers`` (N, 2) from 0 to 1."""
         return sampling.image(numbers, self.mask, self.corner, self.size)

@@ -20,7 +20,7 @@ UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
 
 
 class VideoUnavailable(ImportError):
-    """The optional packages that write MP4 files are not installed, or their ffmpeg fails."""
+    """MP4 cannot be written: the extra ``video`` is not installed, or its ffmpeg fails."""
 
 
 def check_available() -> None:

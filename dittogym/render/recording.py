@@ -40,16 +40,20 @@ SHORTEST = 4.0
 class FilmOptions:
     """Options of films, filmstrips and replays.
 
+    Films take all but ``pictures``, filmstrips take ``size``, ``zoom``, ``muscles`` and ``pictures``, and replays take
+    ``speed``.
+
     Attributes:
-        size: Pixels per side of a picture.
+        size: Pixels per side of a picture, from 16 to 8192.
         rate: Pictures per second of a film, at least 0.01.
-        speed: Of playback, 1 is real time; ``None``: :attr:`Recording.default_speed`.
-        zoom: A picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
+        speed: Speed of playback, 1 for real time; ``None`` for :attr:`Recording.default_speed`.
+        zoom: A picture shows ``1 / zoom`` metres, at most 20 m; ``None`` for 0.56 m, a little more than the robot
+            observes.
         muscles: Colour the robot by its muscles: contraction red, expansion blue.
-        pictures: Number of pictures of a filmstrip, from the start to the end at equal intervals.
+        pictures: Number of pictures of a filmstrip, at equal intervals from the start to the end.
 
     Raises:
-        ValueError: One is out of range.
+        ValueError: An option is out of range.
     """
 
     size: int = 512
@@ -74,10 +78,10 @@ class Recording:
 
     Attributes:
         scene: The static parts of the scene.
-        shots: The start, then one moment after each step.
-        rewards: Of the steps.
-        observation: (3, 64, 64) uint8, the last one.
-        success: Whether the last step counts as success; ``None`` where the task does not define it.
+        shots: T + 1 moments: the start, and one after each of the T steps.
+        rewards: T rewards.
+        observation: (3, 64, 64) uint8, the last observation.
+        success: Whether the task is solved in the last step; ``None`` where it does not define success.
     """
 
     scene: Scene
@@ -92,12 +96,12 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Simulated time, s."""
+        """Simulated time of the episode, s."""
         return len(self.rewards) * self.scene.dt
 
     @property
     def default_speed(self) -> float:
-        """Real time, or the next of 0.5, 0.2, 0.1, ... at which the film takes at least four seconds."""
+        """The first speed of 1 (real time), 0.5, 0.2, 0.1, ... with which a film takes four seconds or more."""
         return next((speed for speed in SPEEDS if self.duration / speed >= SHORTEST), SPEEDS[-1])
 
     def picture(
@@ -110,15 +114,18 @@ class Recording:
         caption: tuple[str, str] | None = None,
         legend: bool = False,
     ) -> np.ndarray:
-        """The picture (size, size, 3) uint8 of a moment; between two steps, particles move on straight lines.
+        """Draw a moment; between two steps, particles move on straight lines.
 
         Args:
-            time: s.
-            size: Pixels per side.
-            zoom: As in :meth:`dittogym.TorchEnv.render`.
+            time: Time since the reset, s; a time outside the episode stands for its start or end.
+            size: S, pixels per side, from 16 to 8192.
+            zoom: The picture shows ``1 / zoom`` metres, as in :meth:`dittogym.TorchEnv.render`.
             muscles: Colour the robot by its muscles: contraction red, expansion blue.
-            caption: What to write into the upper left and the upper right corner.
-            legend: Say below the caption what the colours mean.
+            caption: Two texts, for the upper left and the upper right corner; ``None`` for no text.
+            legend: Explain the colours below the caption.
+
+        Returns:
+            (S, S, 3) uint8 in RGB.
 
         Raises:
             ValueError: ``time`` is not a number, ``size`` or ``zoom`` is out of range, or ``muscles`` is not True or
@@ -137,18 +144,22 @@ class Recording:
         return frame(self.scene, before, size, zoom, muscles, caption, legend)
 
     def save(self, path: str | os.PathLike[str], **options: Any) -> Path:
-        """Write a film, a filmstrip or a replay, and return its path.
+        """Write a film, a filmstrip or a replay.
 
         Args:
-            path: ``.mp4``, ``.gif`` or ``.webp``: a film; ``.png``: some pictures beside each other; ``.html``: a page
-                that plays the episode in any browser, also without a network.
-            options: Of :class:`FilmOptions`. Those that this kind of file does not take have no effect, so that several
-                files can share them; ``film(policy, path, ...)`` of an environment refuses them.
+            path: The file, whose suffix chooses the kind: ``.mp4``, ``.gif`` or ``.webp`` for a film; ``.png`` for a
+                filmstrip, pictures beside each other; ``.html`` for a replay, a page that plays the episode in any
+                browser, also without a network.
+            options: Options of :class:`FilmOptions`. Here, those that this kind of file does not take have no effect,
+                so that several files can share them; ``film`` of an environment refuses them.
+
+        Returns:
+            The path.
 
         Raises:
-            ValueError: The suffix is another, or a number is out of range.
+            ValueError: ``path`` has another suffix, or an option is out of range.
             TypeError: There is no such option.
-            dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``, or with an ffmpeg that fails.
+            dittogym.render.film.VideoUnavailable: An MP4 without the extra ``video``, or with an ffmpeg that fails.
         """
         path, chosen = check_path(path), FilmOptions(**options)
         if path.suffix == ".html":
@@ -163,7 +174,10 @@ class Recording:
         return path
 
     def page(self, speed: float | None = None) -> str:
-        """The replay as an HTML page, which begins to play at a ``speed``, see :class:`FilmOptions`.
+        """Return the replay as an HTML page.
+
+        Args:
+            speed: Speed of playback at the beginning, 1 for real time; ``None`` for :attr:`default_speed`.
 
         Raises:
             ValueError: ``speed`` is not positive.

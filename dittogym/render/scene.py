@@ -98,14 +98,16 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """The static parts of a scene.
+    """The static parts of what pictures show.
 
     Attributes:
         task: Name of the task.
         dt: Duration of a control step, s.
-        bodies: The robot, then the object if there is one.
-        solids: Boxes of the obstacles; open sides are infinite.
-        goal: A point in the world, m.
+        bodies: The robot, then the object if there is one. Each has a ``count`` of particles, the ``radius`` with which
+            they are drawn, m, an RGB ``colour``, and ``grains``, whether it is loose matter.
+        solids: Boxes of the obstacles, with ``left``, ``right``, ``bottom`` and ``top``, m, which are infinite at open
+            sides, and ``filled``, whether more than the outline is drawn.
+        goal: Point (x, y) in the world, m; ``None`` for no goal.
         target: Outlines (K, 2) of the picture to match, and of its holes, relative to the robot's centre, m.
     """
 
@@ -133,11 +135,12 @@ class Shot(NamedTuple):
     """One moment of one simulation.
 
     Attributes:
-        x: (N, 2) float32 positions in the world, m.
-        values: Quantities of :data:`SCALES` by name, uint8 over the range of their scale: (N,), of the muscles (n,) for
-            the robot's particles; these are missing where nothing has acted yet.
+        x: (N, 2) float32 positions of the particles in the world, m.
+        values: Quantities of the particles by name, as uint8 from 0 for the lowest to 254 for the highest value:
+            ``"muscle"`` (n,) of the robot's n particles, from -1, expansion, to 1, contraction, missing before the
+            first step; ``"deformation"`` (N,), the shear strain from 0 to 0.1; ``"speed"`` (N,), from 0 to 1.5 m/s.
         origin: (2,) lower left corner of the simulated window in the world, m.
-        view: (2,) centre of the observed region in the window, m.
+        view: (2,) centre of the observed region, relative to ``origin``, m.
         centre: (2,) the robot's centre in the world, m.
         step: Control steps since the reset.
     """
@@ -150,7 +153,14 @@ class Shot(NamedTuple):
     step: int
 
     def corner(self, width: float) -> np.ndarray:
-        """Lower left corner (2,) in the world of a square picture, m, kept inside the simulated window."""
+        """Return the lower left corner of a picture around the observed region, kept inside the simulated window.
+
+        Args:
+            width: Width of the square picture, m.
+
+        Returns:
+            (2,) position in the world, m.
+        """
         half = width / 2
         middle = np.clip(self.view, half, 1 - half) if width < 1 else np.full(2, 0.5)
         return np.asarray(self.origin + middle - half)

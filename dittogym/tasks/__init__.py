@@ -86,19 +86,29 @@ def _registration_fault(task: str, module: str, name: str) -> str:
 def make_spec(
     task: str | TaskSpec, *, body: BodyLike | None = None, obstacles: Sequence[Obstacle] | None = None, **options: Any
 ) -> TaskSpec:
-    """The specification of a task.
+    """Return the specification of a task, with its options.
 
     Args:
-        task: A name from :data:`dittogym.TASKS`, ``"MODULE:NAME"`` with a module that registers it on import, or a
-            specification.
-        body: Another robot, see :func:`dittogym.bodies.drawings.with_body`.
-        obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
-        options: Options of that task, such as ``target`` of SHAPE MATCH.
+        task: A name from :data:`dittogym.TASKS`; ``"MODULE:NAME"`` with a module, in the working directory or on the
+            Python path, that registers the name when it is imported; or a specification.
+        body: Another robot, see :func:`dittogym.bodies.drawings.with_body`; ``None`` for the task's own.
+        obstacles: Obstacles in place of all of the task's own, floor and ceiling included, such as those that
+            :func:`dittogym.geometry.solid` makes; ``None`` for the task's own.
+        options: Options of this task: ``target`` and ``fit`` of SHAPE MATCH, ``variant`` of SLOT, or arguments of the
+            function that a custom task is registered with.
 
     Raises:
-        ValueError: There is no such task, one of its bodies leaves the window or overlaps an obstacle, or its robot
-            reaches into the bounding box of the object or counts as torn from the start.
-        TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
+        ValueError: There is no such task, an option is out of range, a body leaves the window or overlaps an obstacle,
+            the robot reaches into the bounding box of the object or counts as torn from the start, or the goal lies
+            outside a fixed window.
+        TypeError: The task has no such option, or ``obstacles`` is not a sequence of
+            :class:`dittogym.geometry.Obstacle`.
+
+    Examples:
+        >>> import dittogym
+        >>> spec = dittogym.make_spec("shapematch", target="M")
+        >>> spec.horizon, spec.coarse, spec.fine
+        (30, 32, 64)
     """
     if isinstance(task, TaskSpec):
         name, make = task.name, lambda: task

@@ -24,11 +24,14 @@ def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
 
 
 def shapematch(target: DrawingLike = "star", fit: bool = True) -> TaskSpec:
-    """The task SHAPE MATCH.
+    """Return the task SHAPE MATCH; its arguments are options of the environments.
 
     Args:
-        target: See :func:`dittogym.tasks.targets.load_target`.
-        fit: Whether a drawing is scaled and moved to fit the robot, see there.
+        target: The shape to take, see :func:`dittogym.tasks.targets.load_target`.
+        fit: Whether a drawing is scaled and moved to fit the robot, see :func:`dittogym.tasks.targets.load_target`.
+
+    Raises:
+        ValueError: As in :func:`dittogym.tasks.targets.load_target`.
     """
     return TaskSpec(
         name="shapematch",

@@ -94,10 +94,11 @@ def reward_fn(transition: Transition, spec: TaskSpec) -> Reward:
 
 
 def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec:
-    """The task SLOT.
+    """Return the task SLOT; its argument is an option of the environments.
 
     Args:
-        variant: ``"registered"``, or ``"published"`` for the material of the published training run.
+        variant: ``"registered"`` for the material of the reference implementation's registered environment, or
+            ``"published"`` for that of the published training run.
 
     Raises:
         ValueError: There is no such variant.

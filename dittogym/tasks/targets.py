@@ -46,18 +46,20 @@ _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
 
 
 def load_target(target: DrawingLike, fit: bool = True) -> np.ndarray:
-    """A target as a (64, 64) bool array, row 0 at the top.
+    """Read a target of SHAPE MATCH.
 
     Args:
-        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, an array (H, W), (H, W, 3) or (H, W, 4),
-            bool, uint8 0..255, or floating point 0..1, or corners (K, 2) of an outline, x to the right and y upwards.
-            What is drawn is found by :func:`dittogym.bodies.images.read_mask`.
-        fit: Whether a drawing of another size or in another place is scaled to the robot's area, and moved to its
-            centre, which is always in the middle of the observation. Without, the picture is resized as a whole.
+        target: ``"star"``, ``"I"``, ``"M"`` or ``"T"``; or a picture or an outline, in the forms and with the rules of
+            :func:`dittogym.bodies.drawings.with_body`.
+        fit: Whether a drawing of another size or in another place is scaled to the robot's area and moved to the middle
+            of the picture, where the robot's centre is. With False the picture is only resized as a whole.
+
+    Returns:
+        (64, 64) bool, row 0 at the top. A warning says why if no robot can be expected to match it.
 
     Raises:
-        ValueError: Neither a name nor a readable image or outline, an array of another kind, or a picture without any
-            pixel set or unset.
+        ValueError: ``target`` is neither a name nor a readable picture or outline, or no pixel or every pixel of it is
+            drawn; or ``fit`` is not True or False.
     """
     checks.flag("fit", fit)
     if isinstance(target, str) and target in _OUTLINES:
