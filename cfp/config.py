@@ -34,12 +34,12 @@ TASK_OPTIONS = ("target", "variant")
 
 @dataclass(frozen=True, kw_only=True)
 class EnvironmentConfig:
-    """Options of `dittogym.TorchEnv`."""
+    """Options of the environment, see `dittogym.TorchEnv`."""
 
     num_envs: int = 16
     """Number of robots simulated side by side."""
     particles: Particles = "lite"
-    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
+    """Particles: full (the paper's), lite (about 2,000), the robot's number, or the numbers of robot and object."""
     substeps: int | None = None
     """Substeps of a control step; None: as many as take 10 ms."""
     dt: float = DT
@@ -51,29 +51,29 @@ class EnvironmentConfig:
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
-    """Draw the particles anew at every reset; only with soft actor-critic, and not in GROW and OBSTACLE, whose starts
-    are alike."""
+    """Draw the particles anew at every reset; only with soft actor-critic, and without effect in GROW and OBSTACLE,
+    whose starts are alike."""
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: str | None = None
-    """For SLOT the material: registered (of the registered environment; None too) or published (of the training)."""
+    """Material of SLOT: registered (that of the registered environment, as None) or published (of the training)."""
 
     def task_options(self) -> dict[str, Any]:
-        """The options that belong to the task, for `dittogym.make_spec`."""
+        """Return the options that belong to the task, for `dittogym.make_spec`."""
         return {name: value for name in TASK_OPTIONS if (value := getattr(self, name)) is not None}
 
     @property
     def control_step(self) -> float:
-        """Duration of an environment step, s."""
+        """Duration of a control step, s."""
         return CONTROL_STEP if self.substeps is None else self.substeps * self.dt
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """What is learned, by what and where; these options choose the defaults of all others."""
+    """Task, algorithm, preset, seed and device of a training, which choose the defaults of all other options."""
 
     task: str
-    """Task; MODULE:NAME for a custom task that the module registers."""
+    """Name of the task; MODULE:NAME for a custom task that the module registers."""
     algo: str
     """Name of the algorithm; MODULE:CLASS for one of your own."""
     preset: Preset = "quick"
@@ -86,12 +86,15 @@ class TaskConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(EnvironmentConfig, TaskConfig):
-    """Options of a training that every algorithm has; its stages are counted from 1."""
+    """Options of a training that every algorithm has.
+
+    Stages are counted from 1. The values of an object are not checked before `check` is called, as `cfp.fit` does.
+    """
 
     eval_every: int = 10_000
     """Environment steps between evaluations; 0: none."""
     eval_episodes: int = 5
-    """Episodes of an evaluation and of the final table; a plan is evaluated in the one that it was made for."""
+    """Episodes of an evaluation and of the final table; a plan is evaluated in the one episode it was made for."""
     eval_deterministic: bool = False
     """Evaluate without action noise, where the policy has some."""
     checkpoint_every: int = 1_000
@@ -117,7 +120,7 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         return f"{task_name(self.algo)}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def make_spec(self) -> TaskSpec:
-        """The task, with its options."""
+        """Return the task with its options, a `dittogym.TaskSpec`."""
         return make_spec(self.task, **self.task_options())
 
     @property
@@ -148,35 +151,41 @@ class RunConfig(EnvironmentConfig, TaskConfig):
         return replace(config, dt=dt, substeps=substeps)
 
     def ends(self) -> tuple[int, ...]:
-        """Environment steps since the beginning of the run after which each stage ends."""
+        """Return the environment steps since the beginning of the run after which each stage ends.
+
+        Subclasses implement this; the length of the result is the number of stages.
+        """
         raise NotImplementedError
 
     def stage_steps(self, stage: int) -> int:
-        """Environment steps of a stage."""
+        """Return the number of environment steps of a ``stage``."""
         bounds = (0, *self.ends())
         return bounds[stage] - bounds[stage - 1]
 
     def resolution(self, stage: int) -> int:
-        """Action grid R of a stage."""
+        """Return the action grid R of a ``stage``; subclasses implement this."""
         raise NotImplementedError
 
     def action_size(self, stage: int) -> int:
-        """Rows and columns of the actions that the environment of a stage takes."""
+        """Return rows and columns of the actions that the environment of a ``stage`` takes."""
         return self.resolution(stage)
 
     def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes and of the evaluations that choose the policy; None: the task's own."""
+        """Return the conditions of episodes in training, and of the evaluations that choose the policy, in a ``stage``.
+
+        None stands for the task's own.
+        """
         return None
 
     def evaluation(self, stage: int) -> tuple[int, int]:
-        """Seed of the first episode, and number of episodes, of the evaluations during a stage."""
+        """Return the seed of the first episode, and the number of episodes, of the evaluations in a ``stage``."""
         return self.seed + EVALUATION_SEED, self.eval_episodes
 
     def check(self) -> None:
-        """Check what the types do not express.
+        """Check the values of all options.
 
         Raises:
-            ConfigError: An option is wrong.
+            cfp.ConfigError: An option is out of range, or does not go with another.
         """
         check_task(self.task)
         for name, value in vars(self).items():  # JSON files and command lines can contain NaN and infinity
@@ -202,7 +211,7 @@ Config = TypeVar("Config", bound=RunConfig)
 
 @dataclass(frozen=True, kw_only=True)
 class StagedConfig(RunConfig):
-    """A run that trains several stages with action grids of increasing resolution.
+    """Options of a run that trains several stages with action grids of increasing resolution.
 
     Options with a value for each stage are listed coarsest first; the last value holds for all further stages, and
     values beyond the last stage have no effect.
@@ -211,19 +220,19 @@ class StagedConfig(RunConfig):
     steps: int
     """Environment steps of all stages together, including those that start_from replaces."""
     handover: tuple[float, ...]
-    """Share of the steps at which the next stage begins, for each stage but the last."""
+    """Share of the steps at which the next stage begins, from 0 to 1, for each stage but the last."""
     resolutions: tuple[int, ...]
     """Action grid R of each stage."""
     gate_bias: tuple[float, ...] = (-3.0,)
     """Bias of the gate logit of each stage but the first."""
     interpolation: Interpolation = "half_pixel"
-    """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
+    """Bicubic upsampling: half_pixel (that of the environment, blended on its patch) or aligned (the reference's)."""
     split: bool = False
     """Separate narrow encoders for observation and action, in the paper's networks; small ones always have them."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "paper"
-    """paper (the paper's), or small (half the size and width; actions join its features)."""
+    """Networks: paper (the paper's), or small (half the size and width; actions join the encoder's features)."""
     fill_missing: bool = True
     """Fill missing pixels (0) from those around them before the policy sees an image."""
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
@@ -234,15 +243,15 @@ class StagedConfig(RunConfig):
         return self.num_envs
 
     def ends(self) -> tuple[int, ...]:
-        """Environment steps since the beginning of the run after which each stage ends."""
+        """Return the environment steps since the beginning of the run after which each stage ends."""
         return (*(round(share * self.steps) for share in self.handover[: len(self.resolutions) - 1]), self.steps)
 
     def resolution(self, stage: int) -> int:
-        """Action grid R of a stage."""
+        """Return the action grid R of a ``stage``."""
         return self.resolutions[stage - 1]
 
     def action_size(self, stage: int) -> int:
-        """Rows and columns of the actions that the environment of a stage takes."""
+        """Return rows and columns of the actions that the environment of a ``stage`` takes."""
         return self.actor_spec(stage).action_size
 
     def actor_spec(self, stage: int) -> ActorSpec:
@@ -285,33 +294,37 @@ class StagedConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CoarseToFineConfig(StagedConfig):
-    """A run of the coarse-to-fine policy, which may begin with a trained one.
+    """Options of a run of the coarse-to-fine policy, which may begin with a trained one.
 
     The conditions of training episodes may differ (domain randomisation; Tobin et al., IROS 2017). Evaluations in
-    training, which choose the policy, take place under such conditions too, the table at the end under the task's own.
+    training, which choose the policy, take place under such conditions, too; those of the final table under the task's
+    own.
     """
 
     vary: float = 0.0
     """Probability with which each condition of a training episode is drawn from its range; 0: all are the task's."""
     vary_latency: int = 2
-    """Control steps by which actions come late, at most."""
+    """Largest number of control steps by which actions come late."""
     vary_noise: float = 0.2
-    """Standard deviation of normal noise on actions, at most."""
+    """Largest standard deviation of normal noise on actions."""
     vary_actions: float = 0.2
-    """Share of the entries of an action that are missing in every step, at most."""
+    """Largest share of the entries of an action that are missing in every step."""
     vary_pixels: float = 0.2
-    """Share of the entries of an image that are missing in every step, at most."""
+    """Largest share of the entries of an image that are missing in every step."""
     vary_physics: float = 0.2
-    """Relative change of mu, yield stress and gravity, at most."""
+    """Largest relative change of mu, yield stress and gravity."""
     vary_start: float = 1.0
-    """Change of the start, at most: 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
+    """Largest change of the start; 1 stands for 0.01 m, 5 degrees and 0.05 m/s."""
     start_from: str | None = None
-    """Policy to begin after: a run folder, a file, the name of one that comes with the package, or hf://OWNER/NAME."""
+    """Policy whose stages come first: a run folder, a file, one that comes with the package, or hf://OWNER/NAME."""
     refine: bool = False
-    """Continue to train the last stage of start_from instead."""
+    """Continue to train the last stage of start_from instead of adding stages to it."""
 
     def conditions(self, stage: int) -> Conditions | None:
-        """Those of training episodes of a ``stage`` and of evaluations that choose the policy; None: the task's own."""
+        """Return the conditions of episodes in training, and of the evaluations that choose the policy, in a ``stage``.
+
+        None stands for the task's own.
+        """
         if not self.vary:
             return None
         factors = (1.0 - self.vary_physics, 1.0 + self.vary_physics)
@@ -351,9 +364,9 @@ class LearningConfig:
     learning_rate: float = 3e-4
     """Adam's step size for actor and critics."""
     gamma: float = 0.99
-    """Discount factor."""
+    """Discount factor, from 0 to 1."""
     tau: float = 0.005
-    """Polyak factor of the target critics."""
+    """Rate at which the target critics follow the critics in each update: target = (1 - tau) target + tau critic."""
     batch_size: int = 256
     """Transitions in an update."""
     buffer_size: int = 200_000
@@ -363,9 +376,9 @@ class LearningConfig:
     update_start: int = 256
     """Updates begin when more transitions than this are stored."""
     n_steps: int = 1
-    """Steps whose rewards a critic's target sums up."""
+    """Steps whose rewards a critic's target sums up (n-step returns)."""
     final_rate: float = 1.0
-    """Fraction of the learning rates at the end of a stage; they fall linearly."""
+    """Fraction of the learning rates that is left at the end of a stage; they fall linearly."""
     weight_average: float = 0.0
     """Decay of the average of the actor's weights over updates, which is the policy; 0: the actor itself."""
 
@@ -389,7 +402,7 @@ class LearningConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Hyperparameters(LearningConfig):
-    """All hyperparameters of one stage of soft actor-critic: those of `LearningConfig` and those of the stage."""
+    """All hyperparameters of one stage of soft actor-critic, for `cfp.CFP`."""
 
     alpha: float = 0.01
     """Entropy temperature."""
@@ -402,7 +415,7 @@ class Hyperparameters(LearningConfig):
     noise_cells: int = 0
     """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
     noise_scale: tuple[float, float] = (0.05, 0.4)
-    """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
+    """Standard deviation of this noise before tanh, of the first and of the last robot; one robot has the first."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
@@ -416,12 +429,12 @@ class Hyperparameters(LearningConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(LearningConfig, CoarseToFineConfig):
-    """A run of the coarse-to-fine policy that learns from rewards alone, by soft actor-critic."""
+    """Options of a run of the coarse-to-fine policy that learns from rewards alone, by soft actor-critic."""
 
     algo: str = "cfp-sac"
     """Name of the algorithm."""
     random_steps: tuple[int, ...]
-    """Uniformly random environment steps at the start of each stage (none where a policy is refined)."""
+    """Environment steps with uniformly random actions at the start of each stage; none if a policy is refined."""
     alpha: tuple[float, ...]
     """Entropy temperature of each stage."""
     gate_penalty: tuple[float, ...]
@@ -431,9 +444,9 @@ class SACConfig(LearningConfig, CoarseToFineConfig):
     noise_cells: int = 0
     """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
     noise_scale: tuple[float, float] = (0.05, 0.4)
-    """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
+    """Standard deviation of this noise before tanh, of the first and of the last robot; one robot has the first."""
     max_episode_steps: int | None = None
-    """Steps after which training episodes end, the first ones earlier; None: the horizon, and all begin together."""
+    """Control steps after which training episodes end, the first ones at staggered times; None: all at the horizon."""
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
@@ -464,7 +477,7 @@ class SACConfig(LearningConfig, CoarseToFineConfig):
 class WindowConfig(RunConfig):
     """Options of learners that differentiate windows of simulation and value their ends by a critic.
 
-    The environment options say where the policy is evaluated; train_particles and train_dt, where it is trained.
+    The environment options apply to evaluations, train_particles and train_dt to the simulations in training.
     Evaluations always use the task's own reward.
     """
 
@@ -475,7 +488,7 @@ class WindowConfig(RunConfig):
     window: int = 16
     """Control steps that a gradient reaches back."""
     gamma: float = 0.98
-    """Discount factor."""
+    """Discount factor, from 0 to 1."""
     learning_rate: float = 1e-3
     """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
     td_lambda: float = 0.95
@@ -487,17 +500,17 @@ class WindowConfig(RunConfig):
     max_grad_norm: float = 1.0
     """Largest norm of a gradient of the networks, of actor and critic each."""
     max_episode_steps: int = 400
-    """Control steps after which training episodes end, the first ones earlier; at most the task's horizon."""
+    """Control steps after which training episodes end, the first ones at staggered times; at most the horizon."""
     num_layouts: int = 16
     """Particle layouts that training episodes start from in turn, under varied conditions as many as episodes; in
     GROW and OBSTACLE all are the same."""
     reward: Literal["task", "speed"] = "task"
     """Training reward: task (its own, made smooth) or speed (60 per m/s to the right, less the cost of action)."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of how much spread / limit exceeds split_margin; no effect in
-    tasks without a limit, such as SHAPE MATCH."""
+    """Weight of the cost of a large spread: the square of the amount by which spread / limit exceeds split_margin; no
+    effect in tasks without a limit, such as SHAPE MATCH."""
     split_margin: float = 0.85
-    """Fraction of the limit beyond which the spread costs."""
+    """Fraction of the limit above which the spread costs."""
     integrity_weight: float = 300.0
     """Weight of the cost of neighbouring particles that drift apart within a window."""
     piece_weight: float = 0.0
@@ -524,14 +537,14 @@ class WindowConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class AnalyticConfig(WindowConfig, CoarseToFineConfig):
-    """A run of the coarse-to-fine policy that learns by gradients through the simulation."""
+    """Options of a run of the coarse-to-fine policy that learns by gradients through the simulation."""
 
     algo: str = "cfp-analytic"
     """Name of the algorithm."""
     action_step: tuple[float, ...]
-    """Root mean square of each step on the actions of a window, for each stage."""
+    """Root mean square of each gradient step on the actions of a window, before tanh, for each stage."""
     final_step: float = 0.4
-    """Fraction of action_step at the end of a stage; it falls linearly."""
+    """Fraction of action_step that is left at the end of a stage; it falls linearly."""
     minibatches: int = 16
     """Steps of the regression after each window."""
     minibatch_size: int = 64

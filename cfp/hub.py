@@ -51,7 +51,7 @@ def download(address: str) -> Path:
 
 
 class Shareable:
-    """A policy that can be saved, and pushed to the hub."""
+    """A policy that can be saved, and pushed to the Hugging Face Hub."""
 
     description: dict[str, Any]
 
@@ -76,15 +76,16 @@ class Shareable:
         Needs the extra ``hub`` and a token, see ``hf auth login``.
 
         Args:
-            repo: ``"OWNER/NAME"``; the repository is created if need be.
-            results: Returns for the card, such as `cfp.Run.results`.
-            private: Create the repository as a private one; one that exists stays as visible as it is.
+            repo: Name of the repository, ``"OWNER/NAME"``; it is created if it does not exist.
+            results: Rows of results for the card, such as `cfp.Run.results`.
+            private: Whether a new repository is private; one that exists stays as visible as it is.
 
         Returns:
-            The address of this commit for `cfp.load`.
+            The address of this commit, for `cfp.load` or `baselines.load`.
 
         Raises:
-            ConfigError: The policy comes from no run, so that its task is not known, or the hub refuses it.
+            cfp.ConfigError: The policy comes from no run, so that its task is not known; huggingface_hub is not
+                installed; or the Hub refuses the upload.
         """
         if "kind" not in self.description:
             raise ConfigError(f"policy must come from a run, got one with the description {self.description}")

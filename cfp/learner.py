@@ -49,91 +49,156 @@ FINAL_FRACTION = 0.1
 
 
 class Learner(ABC):
-    """Learns one stage of a run; a stable-baselines3 algorithm, or a planner with the same ``learn``.
+    """Interface of an algorithm: a class whose objects learn one stage of a run.
 
-    The class methods concern the whole run. `create` makes the object for a stage, whose ``learn`` takes the callbacks
-    of the run: they act when a rollout begins and at the end, and may raise to stop.
+    It is a stable-baselines3 algorithm as well, or an object with the same ``learn``. The class methods concern the
+    whole run; `create` makes the object for a stage. The callbacks that a run passes to ``learn`` log, evaluate and
+    write checkpoints when a rollout begins and at the end of a stage; they raise an exception to stop the training.
+
+    Attributes:
+        sees: What its policies look at, ``"image"``, ``"state"``, ``"simulator"`` or ``"nothing"``, for tables; their
+            training may use more.
+        presets: Names of its presets.
+        keeps_best: Whether the policy of a run is that of the best evaluation, or else the newest.
+        config: Options of the run, a `cfp.config.RunConfig`.
+        stage: The stage that it learns, 1 for the first.
+        num_timesteps: Environment steps taken in this stage.
+        starts_trained: Whether the stage begins with a trained policy, which is evaluated before the first step.
+        replay_buffer: Transitions to keep in checkpoints; None for none.
     """
 
-    sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
+    sees: ClassVar[Sees] = "image"
     presets: ClassVar[tuple[str, ...]] = ("quick", "paper")
-    keeps_best: ClassVar[bool] = True  # the policy of a run is that of the best evaluation, otherwise the newest
-    config: Any  # options of the run, a RunConfig
-    stage: int = 1  # in training, 1 is the first
-    num_timesteps: int = 0  # environment steps taken in this stage
-    starts_trained: bool = False  # with a policy that is then evaluated before the first step
-    replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
-    #: Takes at least so many environment steps and learns from them, see stable-baselines3's ``learn``.
+    keeps_best: ClassVar[bool] = True
+    config: Any
+    stage: int = 1
+    num_timesteps: int = 0
+    starts_trained: bool = False
+    replay_buffer: ReplayBuffer | None = None
+    #: A method that takes at least a number of environment steps and learns from them, with the arguments of
+    #: stable-baselines3's ``learn``.
     learn: Callable[..., Any]
 
     @property
     def logger(self) -> Logger:
-        """Where scalars go."""
+        """Where scalars are logged, a logger of stable-baselines3."""
         raise NotImplementedError
 
     @staticmethod
     @abstractmethod
     def preset(task: str, name: str) -> RunConfig:
-        """Default options for a ``task``; the ``name`` of a preset is one of `presets`."""
+        """Return the default options.
+
+        Args:
+            task: A task name, or ``"MODULE:NAME"``.
+            name: Name of a preset, one of `presets`.
+        """
 
     @classmethod
     def begin(cls, config: Any, folder: Path) -> tuple[int, int]:
-        """Put what a new run needs into its ``folder``; returns its first stage and the steps that this one skips."""
+        """Put what a new run needs into its folder.
+
+        Args:
+            config: Options of the run.
+            folder: Its folder.
+
+        Returns:
+            The first stage to learn, and the environment steps of the run that count as taken before it.
+        """
         return 1, 0
 
     @classmethod  # noqa: B027  (most learners need nothing)
     def prepare(cls, config: Any, folder: Path, signals: StopSignals) -> None:
-        """Do what precedes the first stage, such as training a teacher; ``signals`` tell whether to stop."""
+        """Do what precedes the first stage, such as training a teacher.
+
+        Args:
+            config: Options of the run.
+            folder: Its folder.
+            signals: Tells whether the user wants to stop.
+        """
 
     @classmethod
     @abstractmethod
     def create(cls, config: Any, stage: int, folder: Path) -> Learner:
-        """The learner at the beginning of a stage, also where a checkpoint is loaded into it later."""
+        """Make the learner at the beginning of a stage; if the run is resumed, `load_state_dict` follows.
+
+        Args:
+            config: Options of the run.
+            stage: The stage, 1 for the first.
+            folder: Folder of the run, which holds the policies of earlier stages.
+        """
 
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
-        """One line for each stage, from ``first_stage`` on, that will not train as one may expect."""
+        """Return what a user should know before a training begins, such as stages too short to learn anything.
+
+        Args:
+            config: Options of the run.
+            folder: Its folder.
+            first_stage: The stage with which the run begins.
+
+        Returns:
+            Lines to print.
+        """
         return []
 
     @classmethod
     @abstractmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> Policy:
-        """Load the policy that `save_policy` wrote to ``path``, onto a device."""
+        """Load a policy that `save_policy` wrote.
+
+        Args:
+            path: The file ``.safetensors``.
+            device: Device of its tensors.
+        """
 
     @abstractmethod
     def set_logger(self, logger: Logger) -> None:
-        """Set where scalars go."""
+        """Set where scalars are logged, a ``logger`` of stable-baselines3."""
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage in which its policy is not trained yet."""
+        """Environment steps at the beginning of the stage in which the policy does not change yet."""
         return 0
 
     def log_row(self) -> None:  # noqa: B027
-        """Record what belongs into the row of the logs that is being written, beside what was recorded already."""
+        """Record values for the row of the logs that is about to be written, beside those recorded already."""
 
     def images(self) -> dict[str, np.ndarray]:
-        """What to show at an evaluation, uint8 (H, W, 3) by name."""
+        """Return pictures to log at an evaluation, (H, W, 3) uint8 by name."""
         return {}
 
     @property
     @abstractmethod
     def trained_policy(self) -> Policy:
-        """What has been learned so far, as `save_policy` writes it."""
+        """The policy that has been learned so far."""
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy and its ``description`` as a ``.safetensors`` file, see ``cfp.policy.write_policy``."""
+        """Write the policy that has been learned so far, see `cfp.ActorPolicy.save`.
+
+        Args:
+            path: The file, whose name ends in ``.safetensors``.
+            description: What the run knows of the policy, see `cfp.policy.Policy.description`.
+        """
         policy = cast(Shareable, self.trained_policy)
         policy.description = description | policy.description
         policy.save(path)
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """All that learning needs to continue besides `num_timesteps` and `replay_buffer`: tensors and plain values."""
+        """Return what learning needs to continue besides ``num_timesteps`` and ``replay_buffer``.
+
+        Returns:
+            Tensors and plain values by name, for a checkpoint.
+        """
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the ``state`` of `state_dict`, in a learner made with the same options."""
+        """Continue from what `state_dict` returned, in a learner that was made with the same options.
+
+        Args:
+            state: Tensors and plain values by name.
+        """
 
 
 class NetworksPolicy(BasePolicy):

@@ -64,7 +64,12 @@ _MAX_REASON = 300
 
 
 class Policy(Protocol):
-    """A trained policy of any kind, as it comes from its file."""
+    """A trained policy of any kind, as `baselines.load` returns it.
+
+    A policy that acts on the state of a simulation also has a method ``attached``, see
+    `baselines.StatePolicy.attached`. Policies can be saved and pushed to the Hugging Face Hub, see
+    `cfp.ActorPolicy.save` and `cfp.ActorPolicy.push`.
+    """
 
     @property
     def uses_image(self) -> bool:
@@ -72,7 +77,7 @@ class Policy(Protocol):
 
     @property
     def resolution(self) -> int:
-        """Rows and columns of its actions."""
+        """Rows and columns of its actions, for ``gymnasium.make(..., resolution=...)``."""
 
     @property
     def deterministic_by_default(self) -> bool:
@@ -80,12 +85,27 @@ class Policy(Protocol):
 
     @property
     def description(self) -> dict[str, Any]:
-        """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if any."""
+        """What it is and where it comes from, as JSON values by name; empty if that is not known.
+
+        A run stores ``kind``, ``task``, ``resolution`` (the grid R on which it decides), ``stage``, ``steps`` and
+        ``seed`` of the training, ``deterministic``, and the options of the ``environment``. A plan for a single start
+        also has its ``layout``, the seed of the initial positions.
+        """
 
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Memory]:
-        """Choose actions, see `ActorPolicy.predict`."""
+        """Choose actions, with the signature of stable-baselines3's ``predict``.
+
+        Args:
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
+            state: Memory that the last call returned; ``None`` at the beginning, or for a policy without memory.
+            episode_start: (B,) bool, true for elements whose episode begins.
+            deterministic: Act without noise.
+
+        Returns:
+            Actions (2, R, R) or (B, 2, R, R) float32, and the memory for the next call.
+        """
 
 
 def check_images(observation: object) -> None:
@@ -100,12 +120,21 @@ def check_images(observation: object) -> None:
 
 
 class ActorPolicy(nn.Module, Shareable):
-    """An actor with stable-baselines3's ``predict``; `cfp.load` returns one.
+    """A policy of the coarse-to-fine method, a torch module; `cfp.load` returns one.
 
     Args:
         spec: Structure of the actor.
         deterministic_by_default: Whether the run that trained it evaluates it without noise.
-        actor: Of that structure, which is copied; None: one with random weights.
+        actor: An actor of this structure, which is copied; None for one with random weights.
+
+    Attributes:
+        spec: Structure of the actor, a `cfp.ActorSpec`.
+        actor: The networks, a torch module: ``actor(images, deterministic)`` returns actions (B, 2, R, R) for images
+            (B, 3, 64, 64), uint8 or floating point in [-1, 1].
+        description: What it is and where it comes from, see `cfp.policy.Policy.description`.
+        deterministic_by_default: Whether the run that trained it evaluates it without noise.
+        observation_space: ``Box(0, 255, (3, 64, 64), uint8)``.
+        action_space: ``Box(-1, 1, (2, R, R), float32)``.
     """
 
     uses_image = True
@@ -126,12 +155,19 @@ class ActorPolicy(nn.Module, Shareable):
         return self.spec.action_size
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``.
+        """Return actions for a batch of images.
 
-        For gradients with respect to an image call ``actor``, which takes floating-point ones in [-1, 1].
+        For gradients with respect to an image call ``actor``, which takes floating-point images in [-1, 1].
+
+        Args:
+            observation: (B, 3, 64, 64) uint8.
+            deterministic: Act without noise.
+
+        Returns:
+            (B, 2, R, R).
 
         Raises:
-            ValueError: The observation has another type or shape.
+            ValueError: ``observation`` has another type or shape.
         """
         if observation.dtype != torch.uint8 or observation.shape[1:] != SHAPE:
             kind, shape = str(observation.dtype).removeprefix("torch."), tuple(observation.shape)
@@ -143,7 +179,15 @@ class ActorPolicy(nn.Module, Shareable):
         return action
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
+        """Write the policy to a file ``.safetensors``, and its description to a file ``.json`` beside it.
+
+        Args:
+            path: The file, whose name ends in ``.safetensors``.
+
+        Raises:
+            cfp.ConfigError: ``path`` has another suffix, or ``description`` is not complete, as it is for a policy that
+                comes from no run.
+        """
         write_policy(path, self.actor.state_dict(), self.description, shared=True)
 
     def predict(
@@ -153,7 +197,7 @@ class ActorPolicy(nn.Module, Shareable):
 
         Args:
             observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
-            state: Hidden state with leading B, returned as it is: the policy has no memory.
+            state: Returned as it is: the policy has no memory.
             episode_start: (B,) bool, without effect.
             deterministic: Act without noise.
 
@@ -176,8 +220,9 @@ class ActorPolicy(nn.Module, Shareable):
             deterministic: Act without noise.
 
         Returns:
-            Actions (2, A, A) or (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage
-            (2, R, R) or (B, 2, R, R), 0 where the coarser action is kept; ``None`` for a policy of one stage.
+            Actions (2, A, A) or (B, 2, A, A) float32, where A is `resolution`; and the gate of the last stage (2, R, R)
+            or (B, 2, R, R) on its action grid R, from 0 where the coarser action is kept to 1 where it is replaced, or
+            ``None`` for a policy of one stage.
 
         Raises:
             ValueError: The observation is neither an image nor a batch of images.
@@ -195,7 +240,7 @@ class ActorPolicy(nn.Module, Shareable):
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> ActorPolicy:
-    """Load a trained policy; nothing is unpickled.
+    """Load a trained coarse-to-fine policy; nothing is unpickled. `baselines.load` also loads those of others.
 
     Args:
         path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, the name of a policy that comes with
@@ -205,11 +250,11 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> ActorPolicy:
 
     Returns:
         A policy with stable-baselines3's ``predict``. ``policy.resolution`` is for ``gymnasium.make(...,
-        resolution=...)``; ``policy.description`` holds the task and the options of its training.
+        resolution=...)``, and ``policy.description`` holds the task and the options of its training.
 
     Raises:
-        CheckpointError: The file is missing, damaged, or not such a policy.
-        ConfigError: There is no such device, or huggingface_hub is not installed for an address on the Hub.
+        cfp.CheckpointError: The file is missing, damaged, or not a coarse-to-fine policy, or cannot be downloaded.
+        cfp.ConfigError: There is no such device, or huggingface_hub is not installed for an address on the Hub.
 
     Examples:
         >>> import cfp, dittogym, gymnasium

@@ -140,19 +140,29 @@ MANY_UPDATES = ("kick", "obstacle", "grow", "slot", "dig")
 
 
 def preset(task: str, name: Preset = "quick", algo: str | None = None) -> SACConfig | AnalyticConfig:
-    """The defaults of a task.
+    """Return the default options of a training; ``dataclasses.replace`` changes some of them.
 
     Args:
-        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published,
-            has its own action grids, with ``"cfp-sac"`` the numbers of RUN, and no preset ``"paper"``.
-        name: ``"paper"``: the published numbers, one robot with full particles, and the reference's interpolation.
-            ``"quick"``: several robots with fewer particles, minutes instead of days. For ``"cfp-sac"`` also
-            ``"long"``, the same as ``"quick"`` with more steps: half an hour (SHAPE MATCH) to three hours of a core.
-        algo: ``"cfp-analytic"`` or ``"cfp-sac"``; by default ``"cfp-analytic"`` for ``"quick"``, and ``"cfp-sac"`` for
-            the other presets, which have no other.
+        task: A name from `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, has
+            its own action grids and, for ``"cfp-sac"``, the numbers of RUN; it has no preset ``"paper"``.
+        name: ``"quick"`` for several robots with fewer particles, which takes minutes; ``"long"``, only for
+            ``"cfp-sac"``, for the same with more steps, half an hour (SHAPE MATCH) to three hours of a core; or
+            ``"paper"``, only for ``"cfp-sac"``, for the published numbers, with one robot of full particles and the
+            interpolation of the reference implementation, which takes days.
+        algo: ``"cfp-analytic"`` or ``"cfp-sac"``; None for ``"cfp-analytic"`` with ``"quick"``, and ``"cfp-sac"`` with
+            the other presets.
+
+    Returns:
+        The options, a `cfp.AnalyticConfig` or a `cfp.SACConfig`.
 
     Raises:
-        ConfigError: There is no such task, preset or algorithm.
+        cfp.ConfigError: There is no such task or algorithm, or it has no such preset.
+
+    Examples:
+        >>> import cfp
+        >>> options = cfp.preset("run")
+        >>> options.algo, options.resolutions, options.steps
+        ('cfp-analytic', (8, 16), 12800)
     """
     algo = algo or default_algo(name)
     if algo not in ("cfp-analytic", "cfp-sac"):

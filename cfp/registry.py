@@ -66,16 +66,19 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Policy:
     """Load a trained policy of any algorithm; nothing is unpickled.
 
     Args:
-        path: As in `cfp.load`: a run folder, a ``.safetensors`` file, ``"hf://OWNER/NAME"``, ...
-        device: Where its tensors go.
+        path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, the name of a policy that comes with the
+            package, or ``"hf://OWNER/NAME"`` on the Hugging Face Hub, as in `cfp.load`.
+        device: Device of its tensors.
 
     Returns:
-        A policy with stable-baselines3's ``predict``. Some have a memory, and expect the second result back as
-        ``state``. Its ``description`` tells task and origin.
+        A policy with stable-baselines3's ``predict``, see `cfp.policy.Policy`. It is a `cfp.ActorPolicy`, a
+        `baselines.StatePolicy`, a `baselines.SegmentPolicy` or a `baselines.OpenLoop`, of which the last two have a
+        memory: pass the second result of ``predict`` to the next call as ``state``.
 
     Raises:
-        CheckpointError: No such file, a damaged one, or one that is not such a policy.
-        ConfigError: It is of an algorithm that is not known here.
+        cfp.CheckpointError: The file is missing, damaged, or not a policy, or cannot be downloaded.
+        cfp.ConfigError: There is no such device, the policy is of an algorithm that is not known here, or
+            huggingface_hub is not installed for an address on the Hub.
     """
     file = policy_file(path)
     return find(algo_of(read_policy(file)[1])).load_policy(file, str(device))

@@ -12,18 +12,27 @@ from torch import Tensor
 
 
 class Resumable:
-    """Saves and restores attributes by name: ``parts`` that have a state of their own, and plain ``values``."""
+    """Base class with a `state_dict` and a `load_state_dict` that save and restore attributes by name.
+
+    Attributes:
+        parts: Names of the attributes that have these two methods themselves, such as modules and optimisers.
+        values: Names of the attributes that are tensors, generators of torch, or plain values.
+    """
 
     parts: ClassVar[tuple[str, ...]] = ()
     values: ClassVar[tuple[str, ...]] = ()
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on; tensors on the CPU."""
+        """Return the attributes by name; tensors are on the CPU."""
         state = {name: getattr(self, name).state_dict() for name in self.parts}
         return state | {name: _plain(getattr(self, name)) for name in self.values}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict` in an object made with the same options."""
+        """Restore what `state_dict` returned, in an object that was made with the same options.
+
+        Args:
+            state: The attributes by name.
+        """
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
         for name in self.values:

@@ -31,11 +31,16 @@ class Run:
     """A run in its folder, finished, stopped, or still in training.
 
     Args:
-        folder: Where a training, from Python or from the command line, wrote it.
+        folder: The folder that a training, from Python or from the command line, wrote.
+
+    Attributes:
+        folder: The folder, a ``pathlib.Path``.
+        config: The options of the run, such as a `cfp.AnalyticConfig`.
 
     Raises:
-        CheckpointError: There is no run.
-        ConfigError: ``folder`` cannot be the name of one.
+        cfp.CheckpointError: There is no run in the folder, or its options cannot be read.
+        cfp.ConfigError: ``folder`` cannot be the name of a folder, or the run is of an algorithm that is not known;
+            ``import baselines`` adds those of `baselines.ALGORITHMS`.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -44,21 +49,33 @@ class Run:
 
     @cached_property
     def policy(self) -> Policy:
-        """The policy of the last stage, that with its best evaluation; read at the first access."""
+        """The policy of the last stage that had the best evaluation, a `cfp.policy.Policy`; read at the first access.
+
+        Raises:
+            cfp.CheckpointError: There is no policy yet, or its file is damaged.
+        """
         return registry.load(policy_path(self.folder), choose_device(self.config.device))
 
     @property
     def evaluations(self) -> list[dict[str, float | None]]:
-        """Rows of ``evaluations.csv``: step, stage, and the mean and spread of the returns; None for no value."""
+        """Rows of ``evaluations.csv``, one for each evaluation, empty before the first.
+
+        A row holds ``step`` and ``stage``, the number of ``episodes``, ``mean``, ``std``, ``lowest`` and ``highest`` of
+        their returns, and the share of ``success``, None where the task does not define it.
+        """
         rows = read_table(self.folder / "evaluations.csv")
         return [{name: float(value) if value else None for name, value in row.items()} for row in rows]
 
     @property
     def results(self) -> list[dict[str, Any]]:
-        """Rows of the final table, ``results.json``, beside zero and random action.
+        """Rows of the final table, ``results.json``, for zero and random actions and for the policy.
+
+        A row holds ``policy``, its name; ``action``, its grid, such as ``"8x8"``; the number of ``episodes``; ``mean``,
+        ``std`` and half the 95 % confidence ``interval`` of their ``returns``; and the values ``success``,
+        ``success_whole``, ``torn``, ``piece`` and ``mean_piece`` of `cfp.evaluation.returns.Result`.
 
         Raises:
-            CheckpointError: The run is not finished, or the file cannot be read.
+            cfp.CheckpointError: The run is not finished, or the file cannot be read.
         """
         path = self.folder / "results.json"
         if not path.exists():
@@ -70,11 +87,22 @@ class Run:
         return rows
 
     def film(self, path: str | os.PathLike[str] | None = None, **options: Any) -> Recording:
-        """Record the first episode of the policy's evaluation, which a notebook shows.
+        """Record the first episode of the policy's final evaluation.
 
         Args:
-            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            options: Such as ``size``, ``speed`` and ``zoom``, see :class:`dittogym.render.recording.FilmOptions`.
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write; None
+                writes nothing.
+            options: Options of the file, such as ``size``, ``speed`` and ``zoom``, see
+                :class:`dittogym.render.recording.FilmOptions`.
+
+        Returns:
+            The recording, which a notebook shows.
+
+        Raises:
+            cfp.CheckpointError: There is no policy yet, or its file is damaged.
+            ValueError: An option is out of range, the file does not take it, or ``path`` has another suffix.
+            TypeError: There is no such option, or options are given without ``path``.
+            dittogym.render.film.VideoUnavailable: An MP4 without the extra ``video``, or with an ffmpeg that fails.
         """
         check_film(path, options)  # before the episode
         recording = record_policy(self.config, self.policy)
@@ -83,11 +111,18 @@ class Run:
         return recording
 
     def push(self, repo: str, *, private: bool = False) -> str:
-        """Upload the policy to the Hugging Face Hub, with a model card about the run; see `ActorPolicy.push`.
+        """Upload the policy to the Hugging Face Hub, with a model card about the run, see `cfp.ActorPolicy.push`.
 
         Args:
-            repo: ``"OWNER/NAME"``.
-            private: Create the repository as a private one; one that exists stays as visible as it is.
+            repo: Name of the repository, ``"OWNER/NAME"``; it is created if it does not exist.
+            private: Whether a new repository is private; one that exists stays as visible as it is.
+
+        Returns:
+            The address of this commit, for `cfp.load` or `baselines.load`.
+
+        Raises:
+            cfp.CheckpointError: There is no policy yet, or its file is damaged.
+            cfp.ConfigError: huggingface_hub is not installed, or the Hub refuses the upload.
         """
         finished = (self.folder / "results.json").exists()
         return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)
@@ -133,41 +168,48 @@ def fit(
     on_evaluation: OnEvaluation | None = None,
     **options: Any,
 ) -> Run:
-    """Train a policy, as ``torchmpm train`` does, with the same folder of the run.
+    """Train a coarse-to-fine policy in a run folder, as ``torchmpm train`` does.
 
-    Options that are not given, or None, have the values of `cfp.preset`. Ctrl-C writes a checkpoint and raises
-    `KeyboardInterrupt`; the same call with ``resume=True`` continues. On Linux glibc keeps freed memory from then on,
-    which makes updates of the networks a third faster.
+    Options that are not given, or None, have the values of `cfp.preset`. Ctrl-C writes a checkpoint and raises a
+    KeyboardInterrupt; the same call with ``resume=True`` then continues. As a side effect, on Linux glibc keeps freed
+    memory for the rest of the process, which makes updates of the networks a third faster.
 
     Args:
-        task: Task, or ``"MODULE:NAME"`` for a custom one.
-        algo: ``"cfp-analytic"`` or ``"cfp-sac"``, None: that of the preset; `baselines.fit` has others.
-        preset: ``"quick"``, ``"long"`` or ``"paper"``; None: quick.
-        steps: Environment steps of all stages together.
-        seed: Of everything that is random; None: 0.
-        num_envs: Robots simulated side by side.
-        particles: ``"full"`` (the paper's), ``"lite"`` (about 2,000), a number, or those of robot and object.
-        resolutions: Action grid R of each stage.
-        start_from: A trained policy for the first stages.
-        eval_every: Environment steps between evaluations; 0: none.
+        task: A task name, or ``"MODULE:NAME"`` for a custom task.
+        algo: ``"cfp-analytic"`` or ``"cfp-sac"``; None for that of the preset. `baselines.fit` takes others.
+        preset: ``"quick"``, ``"long"`` or ``"paper"``, see `cfp.preset`; None for quick.
+        steps: Environment steps of all robots in all stages together.
+        seed: Seed of everything that is random; None for 0.
+        num_envs: Number of robots simulated side by side.
+        particles: ``"full"`` (the paper's number), ``"lite"`` (about 2,000), the number of the robot's particles, or
+            the numbers of robot and object.
+        resolutions: Action grid R of each stage, coarsest first.
+        start_from: A trained policy whose stages come first, in the forms that `cfp.load` takes.
+        eval_every: Environment steps between evaluations; 0 for no evaluations.
         eval_episodes: Episodes of an evaluation and of the final table.
         video: Whether to record a video at the end.
         device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
-        out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
-        resume: Continue the run in the folder, or start one if it holds none.
+        out: Folder of the run; None for a folder in ``runs/`` that is named by algorithm, task, preset and seed.
+        resume: Continue the run in the folder, or start one if there is none.
         quiet: Print nothing, and show no progress bar.
-        on_evaluation: Called with each new row of ``evaluations.csv``, see `Run.evaluations`. An exception that it
-            raises ends the training and comes out here; the run can be resumed from its last checkpoint.
-        options: All further ones of the command line, with underscores, such as ``handover=(0.5,)``.
+        on_evaluation: Called with each new row of ``evaluations.csv``, see `cfp.Run.evaluations`. An exception that it
+            raises ends the training and leaves this function; the run can be resumed from its last checkpoint.
+        options: All other options of the algorithm, the fields of `cfp.AnalyticConfig` or `cfp.SACConfig`, such as
+            ``handover=(0.5,)``.
 
     Returns:
         The finished run.
 
     Raises:
-        ConfigError: An option does not exist or is wrong.
-        CheckpointError: A policy or the checkpoint is missing, damaged, or of other options.
-        CFPError: Another process trains in the folder.
-        NonFiniteError: Training has diverged.
+        cfp.ConfigError: There is no such option, or a value is wrong.
+        cfp.CheckpointError: A policy or the checkpoint is missing, damaged, or of other options.
+        cfp.CFPError: Another process trains in the folder.
+        cfp.NonFiniteError: The training has diverged.
+
+    Examples:
+        >>> import cfp
+        >>> run = cfp.fit("run", steps=6400, video=False, out="runs/short")  # doctest: +SKIP
+        >>> returns = [row["mean"] for row in run.evaluations]  # doctest: +SKIP
     """
     options |= _given(algo=algo, preset=preset, steps=steps, seed=seed, num_envs=num_envs, particles=particles)
     options |= _given(resolutions=resolutions, start_from=start_from, video=video, device=device)

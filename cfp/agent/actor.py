@@ -56,22 +56,27 @@ class ActorSpec:
     """Structure of an actor with all of its stages.
 
     Attributes:
-        resolutions: Action grid R of each stage, coarsest first; a single entry describes a plain (stage 1) actor.
-        gate_bias: Bias added to the gate logit, one for each residual stage (``len(resolutions) - 1`` values).
+        resolutions: Action grid R of each stage, increasing numbers of 4, 8, 16, 32 and 64. With a single one, the
+            actor is a plain actor, that of the first stage; actors of later stages are residual.
+        gate_bias: Bias that is added to the gate logit, a number for each residual stage (``len(resolutions) - 1``).
         split: Separate narrow encoders for observation and action, for tasks in which the two images show different
             places; the small networks always have them.
-        gate_scale: Largest gate value; the reference implementation uses 0.25 with split encoders and 1 otherwise.
-        interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` as the environment upsamples actions,
+        gate_scale: Largest value of the gate; the reference implementation uses 0.25 with split encoders and 1
+            otherwise.
+        interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` as the environment upsamples actions, or
             ``"aligned"`` (aligned corners) as the reference implementation does here.
-        patch: Size of the images on which a residual actor blends coarse and residual actions; None blends on the
-            grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
-            the coarser force field only if actions are blended at the size of the environment's patch.
-        encoder: ``"paper"`` for the paper's networks, ``"small"`` for the small ones.
-        fill_missing: Missing pixels of an image are filled from those around them, see `cfp.agent.pixels`.
+        patch: Rows and columns of the images on which a residual actor blends coarse and residual actions, which is
+            then the size of its actions; from the finest resolution to 128. None blends on the grid of the stage, as
+            the reference implementation does. As two cubic upsamplings differ from one, a closed gate leaves the
+            coarser force field as it is only if actions are blended at the size of the environment's patch.
+        encoder: ``"paper"`` for the paper's networks, or ``"small"`` for networks of half the size and width, in which
+            actor and critics share an encoder.
+        fill_missing: Fill entries of an image that are 0, as entries that got lost are, by the mean of the 3 x 3
+            entries around them, where at least five of these are not 0.
 
     Raises:
-        ConfigError: A resolution has no decoder, resolutions do not increase, ``gate_bias`` or ``patch`` do not match
-            them, ``gate_scale`` is not positive, or there is no such encoder or interpolation.
+        cfp.ConfigError: A resolution is another number, resolutions do not increase, ``gate_bias`` or ``patch`` does
+            not go with them, ``gate_scale`` is not positive, or there is no such encoder or interpolation.
     """
 
     resolutions: tuple[int, ...]
@@ -101,7 +106,7 @@ class ActorSpec:
 
     @property
     def action_size(self) -> int:
-        """Rows and columns of the executed action: the patch of a residual actor, else the finest action grid."""
+        """Rows and columns of the actions, the patch of a residual actor or else the finest action grid."""
         return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
 
     @property

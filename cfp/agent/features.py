@@ -11,14 +11,23 @@ from cfp.agent.actor import IMAGE_SIZE, LATENT, Encoder
 
 
 class ImageFeatures(BaseFeaturesExtractor):
-    """Three convolutions with coordinate channels, for ``policy_kwargs={"features_extractor_class": ImageFeatures}``.
+    """The image encoder of the coarse-to-fine policy as a features extractor for stable-baselines3.
+
+    It consists of three convolutions on the image and two coordinate channels, and returns ``16 * width`` features. Use
+    it with ``policy_kwargs={"features_extractor_class": cfp.ImageFeatures}``.
 
     Args:
-        observation_space: uint8 images (3, 64, 64), which stable-baselines3 divides by 255.
+        observation_space: A ``Box`` of uint8 images (3, 64, 64), which stable-baselines3 divides by 255.
         width: Channels of the last layer.
 
     Raises:
         ValueError: The images have another shape.
+
+    Examples:
+        >>> import cfp, gymnasium, stable_baselines3
+        >>> env = gymnasium.make("dittogym/run-coarse-v0", particles="lite")
+        >>> options = {"features_extractor_class": cfp.ImageFeatures}
+        >>> model = stable_baselines3.PPO("CnnPolicy", env, policy_kwargs=options, device="cpu")
     """
 
     def __init__(self, observation_space: spaces.Box, width: int = 32) -> None:

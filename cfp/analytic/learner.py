@@ -160,17 +160,24 @@ class Regression(Resumable):
 class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
     """Learns a stage of the coarse-to-fine policy by gradients through the simulation.
 
-    Each update rolls out a window (SHAC), takes a normalised gradient step on its actions and regresses the actor onto
-    the result (PODS), and trains a privileged critic that values the window's end (SHAC, D.Va). ``predict`` acts by the
-    actor with averaged weights.
+    Each update simulates a window of control steps, as short-horizon actor-critic does (SHAC; Xu et al., ICLR 2022). It
+    then takes a gradient step of a given size on the actions of the window, and fits the actor to the improved actions
+    (PODS; Mora et al., ICML 2021). A critic, which sees the state of the simulation and is needed in training only,
+    values the end of the window and learns TD(lambda) targets (SHAC; D.Va, NeurIPS 2025). ``predict`` acts by the actor
+    with averaged weights. `cfp.fit` trains all stages, with evaluations and checkpoints.
 
     Args:
         policy: ``"NetworksPolicy"``.
-        env: A `cfp.TorchVecEnv`, in which it is trained; num_envs, particles and substeps are the environment's, starts
-            and lengths of episodes those of ``config``.
-        config: Options, see `cfp.preset`.
-        stage: Which stage it learns, 1 is the coarsest.
-        device: Of networks and simulation.
+        env: A `cfp.TorchVecEnv`, in which it is trained. The numbers of robots, particles and substeps are those of the
+            environment, the starts and lengths of episodes those of ``config``. Its actions have the size
+            ``config.action_size(stage)``.
+        config: Options, such as `cfp.preset` returns; None only where stable-baselines3 loads a saved model.
+        stage: The stage that it learns, 1 for the coarsest.
+        device: Device of the networks, that of the simulation.
+        _init_setup_model: Make the networks at once; stable-baselines3 passes False to load a saved model.
+
+    Raises:
+        TypeError: ``env`` is not a `cfp.TorchVecEnv`.
     """
 
     config: AnalyticConfig
@@ -249,10 +256,13 @@ class CFPAnalytic(Resumable, UpdateLoop, CoarseToFine):
         return self.config.warmup * self.config.update_every
 
     def update(self) -> bool:
-        """Play one window and learn from it; False if a callback stops the training.
+        """Simulate one window and learn from it; ``learn`` calls this.
+
+        Returns:
+            False if a callback stops the training.
 
         Raises:
-            NonFiniteError: Actions are not finite, or no gradient of the last windows was.
+            cfp.NonFiniteError: Actions are not finite, or ten windows in a row had no finite gradient other than 0.
         """
         config, progress = self.config, self.progress
         learning_rate = config.learning_rate * linear_decay(progress)

@@ -67,7 +67,17 @@ def make_env(
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:
-    """Create the environment of a run; ``changes`` are further options of `dittogym.TorchEnv`."""
+    """Make the environment of a run, on the device that its options choose.
+
+    Args:
+        config: Options of the run.
+        resolution: R, rows and columns of an action.
+        num_envs: Number of simulations; None for that of the options.
+        changes: Further options of `dittogym.TorchEnv`, such as ``conditions``.
+
+    Raises:
+        cfp.ConfigError: An option is out of range, or does not exist.
+    """
     options = {name: value for name, value in vars(config.environment).items() if name not in TASK_OPTIONS}
     options |= config.environment.task_options() | changes
     options |= {"num_envs": num_envs or options["num_envs"], "device": choose_device(config.device)}

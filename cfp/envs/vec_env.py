@@ -24,25 +24,33 @@ DIVERGED = "an action is not finite: the policy has diverged"
 
 
 class TorchVecEnv(VecEnv):
-    """Batched environment with same-step autoreset, as stable-baselines3 expects it.
+    """A batch of simulations as a vectorised environment of stable-baselines3, a ``VecEnv``.
 
-    Of an element whose episode ends, the first observation of the next one is returned, and the last one is
-    ``info["terminal_observation"]``. ``info["TimeLimit.truncated"]`` is true at the time limit even if the element
-    terminates there, as in the reference implementation. A state that is not finite terminates the episode.
+    An element whose episode ends is reset in the same step: the step returns the first observation of the next episode,
+    and the last observation is ``info["terminal_observation"]``. ``info["TimeLimit.truncated"]`` is true at the time
+    limit even if the task ends the episode there, as in the reference implementation. A state that is not finite
+    terminates the episode.
 
     Args:
-        env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
-        spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
-        max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
-        tensors: Observations are tensors on the device, and so may actions be: of a GPU only numbers, and the last
-            images of episodes, are copied to the host.
+        env: A `dittogym.TorchEnv`, or an object with its interface; it is stepped without gradients.
+        spaces: Spaces of observations and actions of an element; None for those of `dittogym.TorchEnv`.
+        max_episode_steps: Control steps after which episodes are truncated, at most the task's horizon; None for the
+            horizon.
+        tensors: Observations are tensors on the device, and actions may be tensors. From a GPU, only numbers and the
+            last images of episodes are then copied to the host.
         stagger: For training, with ``max_episode_steps``: after a reset of all elements, the first episode of element i
-            is truncated after a fraction ``(i + 1) / B`` of these steps already, so that a batch always holds
+            is already truncated after a fraction ``(i + 1) / B`` of these steps, so that a batch always holds
             beginnings and ends of episodes.
 
     Raises:
-        ValueError: ``max_episode_steps`` is no whole number from 1.
+        ValueError: ``max_episode_steps`` is not a whole number from 1.
         TypeError: ``env`` is a Gymnasium environment.
+
+    Examples:
+        >>> import cfp, dittogym
+        >>> env = cfp.TorchVecEnv(dittogym.TorchEnv("run", num_envs=4, particles="lite"), max_episode_steps=200)
+        >>> env.reset().shape
+        (4, 3, 64, 64)
     """
 
     def __init__(

@@ -145,14 +145,24 @@ class SeededPolicy:
 
 
 class Played(NamedTuple):
-    """How an episode went."""
+    """How an episode of an evaluation went.
 
-    total: float  # its undiscounted return
-    success: bool | None  # None where the task does not define success
-    torn: bool  # ended by the limit on the robot's spread
-    piece: float  # share of the robot in its largest piece after the last step, see `dittogym.pieces`
-    mean_piece: float  # over the steps
-    terms: Mapping[str, float] = {}  # the sum of each term of the reward, with its weight; they add up to the total
+    Attributes:
+        total: Undiscounted return.
+        success: Whether the task was solved in the last step; None where the task does not define success.
+        torn: Whether the limit on the robot's spread ended the episode.
+        piece: Share of the robot in its largest piece after the last step, from 0 to 1, see
+            `dittogym.pieces.largest_piece`.
+        mean_piece: The same share, mean over the steps.
+        terms: Sum of each weighted term of the reward over the episode, by name; they add up to ``total``.
+    """
+
+    total: float
+    success: bool | None
+    torn: bool
+    piece: float
+    mean_piece: float
+    terms: Mapping[str, float] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,35 +270,41 @@ def t_interval(values: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class Result:
-    """Some episodes of a policy."""
+    """The result of an evaluation, as `cfp.evaluate_policy` returns it.
+
+    Attributes:
+        name: Name of the policy in tables.
+        resolution: R of its action grid.
+        episodes: The episodes in the order of their seeds, so that results of two policies can be compared in pairs.
+    """
 
     name: str
-    resolution: int  # of its action grid
-    episodes: tuple[Played, ...]  # in the order of their layouts, so that equal places are equal layouts
+    resolution: int
+    episodes: tuple[Played, ...]
 
     @property
     def returns(self) -> tuple[float, ...]:
-        """Undiscounted returns."""
+        """Undiscounted returns of the episodes."""
         return tuple(episode.total for episode in self.episodes)
 
     @property
     def mean(self) -> float:
-        """Mean return."""
+        """Mean return of the episodes."""
         return float(np.mean(self.returns))
 
     @property
     def std(self) -> float:
-        """Standard deviation of the returns over the episodes (of this sample, not of its mean)."""
+        """Standard deviation of the returns over the episodes, of the sample and not of its mean."""
         return float(np.std(self.returns))
 
     @property
     def interval(self) -> float | None:
-        """Half the width of the 95 % confidence interval of the mean; None for one episode."""
+        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
         return t_interval(self.returns)
 
     @property
     def terms(self) -> dict[str, float]:
-        """What each term of the reward, with its weight, contributes to the mean return."""
+        """What each weighted term of the reward contributes to the mean return, by name."""
         return {name: _mean(each.terms[name] for each in self.episodes) for name in self.episodes[0].terms}
 
     @property
@@ -298,23 +314,23 @@ class Result:
 
     @property
     def success_whole(self) -> float | None:
-        """Share of the episodes that succeed and are not torn."""
+        """Share of the episodes that succeed and are not torn; None where the task does not define success."""
         defined = self.episodes[0].success is not None
         return _mean(bool(each.success) and not each.torn for each in self.episodes) if defined else None
 
     @property
     def torn(self) -> float:
-        """Share of the episodes that are ended by the limit on the robot's spread."""
+        """Share of the episodes that the limit on the robot's spread ended."""
         return _mean(each.torn for each in self.episodes)
 
     @property
     def piece(self) -> float:
-        """Share of the robot in one piece after the last step, a mean over the episodes."""
+        """Share of the robot in its largest piece after the last step, mean over the episodes."""
         return _mean(each.piece for each in self.episodes)
 
     @property
     def mean_piece(self) -> float:
-        """The same over all steps."""
+        """Share of the robot in its largest piece, mean over all steps and episodes."""
         return _mean(each.mean_piece for each in self.episodes)
 
 
@@ -383,26 +399,29 @@ def evaluate_policy(
     deterministic: bool = False,
     **options: Any,
 ) -> Result:
-    """Evaluate any policy as those of this package are: return, success, and mass in one piece.
+    """Evaluate any policy as this package evaluates its own: by return, success, and matter in one piece.
 
-    The result is the same, to the last bit, whatever the number of cores.
+    The result is the same, to the last bit, with any number of cores.
 
     Args:
-        policy: A policy of this package, a model of stable-baselines3, another object with its ``predict(observation,
-            state, episode_start, deterministic)``, which returns actions (B, 2, R, R) and its memory or ``None``, or a
-            function of the observation alone, images (B, 3, 64, 64) uint8.
-        task: A task of `dittogym`, also ``"MODULE:NAME"``, or a specification.
+        policy: A policy of this package; a model of stable-baselines3; another object with the method
+            ``predict(observation, state, episode_start, deterministic)``, which returns actions (B, 2, R, R) and a
+            memory or ``None``; or a function of the observation alone. Observations are (B, 3, 64, 64) uint8.
+        task: A task name, ``"MODULE:NAME"``, or a `dittogym.TaskSpec`.
         episodes: Number of episodes.
-        seed: Of the first episode; the next ones have the seeds after it. With the default value they start from
-            positions on which nothing was trained here.
+        seed: Seed of the first episode; the others have the numbers after it. From the default seed on, episodes start
+            from positions on which no policy of this package was trained.
         deterministic: Act without noise.
-        options: Of the environment, such as ``particles`` and ``conditions``, see `dittogym.TorchEnv`; ``resolution``
-            and ``action_layout`` are those of the policy if it has them.
+        options: Options of the environment, such as ``particles`` and ``conditions``, see `dittogym.TorchEnv`.
+            ``resolution`` and ``action_layout`` are those of the policy, if it has them, unless they are given.
+
+    Returns:
+        Returns, successes and other measures of the episodes.
 
     Raises:
-        TypeError: The policy is of another kind.
+        TypeError: The policy is of another kind, or the task has no such option.
         ValueError: An argument is out of range, or an action has another shape.
-        NonFiniteError: An action or a reward is NaN or infinite.
+        cfp.NonFiniteError: An action or a reward is NaN or infinite.
 
     Examples:
         >>> import cfp, dittogym

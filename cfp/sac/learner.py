@@ -206,29 +206,42 @@ class CellNoise:
 
 
 class CFP(SAC):
-    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
+    """Soft actor-critic with the update rule of the reference implementation (Huang et al., ICLR 2024, Appendix B).
 
-    In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
-    part only, as in the reference implementation. ``predict`` acts by the actor in training; see ``trained_actor``.
+    It runs on the loop of stable-baselines3's ``SAC``, with these differences: rewards are normalised by running
+    statistics, the gradient of each tensor is clipped separately, the gate of a residual actor is penalised, and the
+    phase of random actions is independent of the start of the updates. The target of the critics is ``r + c d (min
+    Q'(s', a') - alpha log pi(a'|s'))`` with the normalised reward r, the discount d and a flag c that is 0 where the
+    task ended the episode; the loss of the actor is the mean of ``alpha log pi - min Q`` plus the gate penalty. In
+    stages after the first, the coarse action is sampled anew in every update, and the entropy covers the residual part
+    only. `cfp.Hyperparameters` also has options for what later publications found.
 
-    With an environment whose observations are tensors, see `TorchVecEnv`, observations, actions and the replay memory
-    stay on the device, and updates do not wait for it: their scalars, and whether they were finite, are read when a row
-    is logged and before anything is saved.
+    ``predict`` acts by the actor in training, see `trained_actor`. With a `cfp.TorchVecEnv` with ``tensors=True``,
+    observations, actions and the replay memory stay on the device, and updates do not wait for it: their scalars, and
+    whether they were finite, are read when a row is logged and before anything is saved.
 
     Args:
-        policy: `CFPPolicy` or its name, or another ``cfp.sac.policies.TwinCriticPolicy``.
-        env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
+        policy: ``"CFPPolicy"``, or `cfp.CFPPolicy` itself.
+        env: A vectorised environment with actions (2, R, R) in [-1, 1], such as a `cfp.TorchVecEnv`.
         hyperparameters: Hyperparameters of the stage.
-        sac_options: Further options of stable-baselines3's SAC, such as ``policy_kwargs``, ``seed`` and ``device``.
+        sac_options: Further arguments of stable-baselines3's ``SAC``, such as ``policy_kwargs``, for instance
+            ``{"spec": cfp.ActorSpec(...)}``, ``seed`` and ``device``.
 
     Raises:
-        TypeError: An option of stable-baselines3 is one of the hyperparameters, or belongs to CFP.
-        ConfigError: A hyperparameter is out of range.
+        TypeError: An argument of stable-baselines3 is one of the hyperparameters, is set by CFP, or does not exist.
+        cfp.ConfigError: A hyperparameter is out of range.
 
     Attributes:
-        average: The actor with averaged weights, see `restart_average`; None without ``weight_average``.
+        hyperparameters: Hyperparameters of the stage.
+        average: The actor with averaged weights; None without ``weight_average``.
         trains_encoder: Whether critics train an encoder that they share with the actor; False where a trained policy
             is refined, which their first updates would change.
+
+    Examples:
+        >>> import cfp, dittogym
+        >>> env = cfp.TorchVecEnv(dittogym.TorchEnv("run", num_envs=2, particles=300, substeps=10))
+        >>> hyperparameters = cfp.Hyperparameters(batch_size=8, buffer_size=64, random_steps=16, update_start=16)
+        >>> model = cfp.CFP("CFPPolicy", env, hyperparameters, seed=0).learn(32)
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
@@ -293,7 +306,11 @@ class CFP(SAC):
 
     @property
     def trained_actor(self) -> Actor:
-        """The actor with averaged weights, or the one in training if there is no average."""
+        """The actor with averaged weights, or the one in training if there is no average.
+
+        Raises:
+            cfp.NonFiniteError: One of the last updates was not finite.
+        """
         self.read_updates()  # so that weights that are not finite are not saved
         return self.networks()[0] if self.average is None else self.average
 
@@ -345,7 +362,18 @@ class CFP(SAC):
         super().dump_logs()
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
-        """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
+        """Perform one update of critics, actor and averages.
+
+        Args:
+            batch: Transitions, as the replay buffer of stable-baselines3 samples them.
+
+        Returns:
+            Scalars by the names of the logs without ``train/``, such as ``critic_loss`` and ``entropy``.
+
+        Raises:
+            cfp.NonFiniteError: A loss or its gradient is not finite; the optimiser's step is not taken. With tensors on
+                the device, the error comes later, when a row is logged.
+        """
         assert isinstance(self.policy, TwinCriticPolicy)
         actor, critic, target = self.networks()
         obs = self.policy.encode(batch.observations)

@@ -176,14 +176,16 @@ class CFPPolicy(TwinCriticPolicy):
     ``predict`` does not clip: a composed action may exceed [-1, 1] by the overshoot of the cubic interpolation.
 
     Args:
-        observation_space: uint8 (3, 64, 64).
-        action_space: float32 (2, R, R) in [-1, 1].
-        lr_schedule: See `TwinCriticPolicy`.
-        spec: Structure of the actor; None: a plain actor of the action space's resolution.
-        options: See `TwinCriticPolicy`.
+        observation_space: A ``Box`` of uint8 images (3, 64, 64).
+        action_space: A ``Box`` of float32 actions (2, R, R) in [-1, 1].
+        lr_schedule: Learning rate as a function of the remaining share of the training, from 1 to 0.
+        spec: Structure of the actor; None for a plain actor of the resolution of the action space.
+        options: Further arguments of stable-baselines3's ``SACPolicy``, such as ``optimizer_class`` and
+            ``optimizer_kwargs``; the default is a fused Adam.
 
     Raises:
-        ValueError: The actions of ``spec`` do not have the shape of the action space, or ``use_sde`` is set.
+        ValueError: The actions of ``spec`` do not have the shape of the action space, or ``use_sde=True`` is given.
+        cfp.ConfigError: There are no networks for actions of this shape, see `cfp.ActorSpec`.
     """
 
     def __init__(
