@@ -21,22 +21,30 @@ def fit(
     resume: bool = False,
     **options: Any,
 ) -> Run:
-    """Train an algorithm, as ``torchmpm train`` does; see `cfp.fit`.
+    """Train any algorithm in a run folder, as ``torchmpm train --algo`` does, see `cfp.fit`.
 
     Args:
-        algo: A name in `ALGORITHMS`.
-        task: Task, or ``"MODULE:NAME"`` for a custom one.
-        steps: Environment steps, for algorithms with this option; None: those of the preset.
-        out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
-        resume: Continue the run in the folder.
-        options: ``quiet``, ``on_evaluation``, and options of the command line with underscores, which ``torchmpm train
-            --algo NAME --help`` lists.
+        algo: A name from `baselines.ALGORITHMS`, or ``"MODULE:CLASS"``.
+        task: A task name, or ``"MODULE:NAME"`` for a custom task.
+        steps: Environment steps of all robots in all stages together, for algorithms with this option; None for those
+            of the preset.
+        out: Folder of the run; None for a folder in ``runs/`` that is named by algorithm, task, preset and seed.
+        resume: Continue the run in the folder, or start one if there is none.
+        options: ``quiet`` and ``on_evaluation`` of `cfp.fit`, and all other options of the algorithm, the fields of its
+            dataclass of options, such as `baselines.GradientConfig`; ``torchmpm train --algo NAME --help`` lists them.
 
     Returns:
         The finished run.
 
     Raises:
-        ConfigError: An option does not exist or is wrong.
-        NonFiniteError: Training has diverged.
+        cfp.ConfigError: There is no such algorithm or option, or a value is wrong.
+        cfp.CheckpointError: A policy or the checkpoint is missing, damaged, or of other options.
+        cfp.CFPError: Another process trains in the folder.
+        cfp.NonFiniteError: The training has diverged.
+
+    Examples:
+        >>> import baselines
+        >>> run = baselines.fit("gradient", "shapematch", video=False, out="runs/plan")  # doctest: +SKIP
+        >>> returns = [row["mean"] for row in run.evaluations]  # doctest: +SKIP
     """
     return runs.fit(task, steps=steps, out=out, resume=resume, algo=algo, **options)

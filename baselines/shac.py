@@ -41,17 +41,17 @@ METRICS: dict[str, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ShacConfig(GridConfig, WindowConfig):
-    """A run of short-horizon actor-critic; num_envs robots learn side by side.
+    """Options of short-horizon actor-critic, in which num_envs robots learn side by side.
 
-    The environment options say where the policy is evaluated; train_particles, where it is trained.
+    The environment options apply to evaluations, train_particles and train_dt to the simulations in training.
     """
 
     algo: str = "shac"
-    """Which algorithm."""
+    """Name of the algorithm."""
     steps: int = 13_000
     """Environment steps of all robots together."""
     noise: float = 0.1
-    """Standard deviation of actions before tanh."""
+    """Standard deviation of the noise on actions, before tanh."""
     displacement: bool = False
     """The policy observes the robot's displacement since the reset."""
 
@@ -83,10 +83,16 @@ class StateActor(nn.Module):
 
 
 class StatePolicy(StateBasedPolicy):
-    """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
+    """A policy that acts on the state of the simulation instead of the image; `baselines.load` returns one.
 
-    ``noise`` is the standard deviation before tanh of actions that are not deterministic; ``description`` says what the
-    policy is and where it comes from, see `cfp.policy.describe_run`.
+    It acts in the environment that is given to `attached`. It reads mass, momentum and deformation of the robot, and
+    mass and momentum of an object, on 16 x 16 cells of the action patch, and the time.
+
+    Args:
+        actor: The network.
+        features: What it reads of the state.
+        noise: Standard deviation of the noise on actions, before tanh.
+        description: What it is and where it comes from, see `cfp.policy.Policy.description`.
     """
 
     def __init__(
@@ -97,7 +103,7 @@ class StatePolicy(StateBasedPolicy):
 
     @property
     def resolution(self) -> int:
-        """Action grid R."""
+        """R, rows and columns of its actions."""
         return self.actor.resolution
 
     @property
@@ -116,13 +122,29 @@ class StatePolicy(StateBasedPolicy):
         return mean.tanh(), state
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
+        """Write the policy to a file ``.safetensors``, and its description to a file ``.json`` beside it.
+
+        Args:
+            path: The file, whose name ends in ``.safetensors``.
+
+        Raises:
+            cfp.ConfigError: ``path`` has another suffix, or ``description`` is not complete, as it is for a policy that
+                comes from no run.
+        """
         own = {"features": dataclasses.asdict(self.features), "noise": self.noise, "inputs": self.actor.inputs}
         write_policy(path, self.actor.state_dict(), self.description | own)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy:
-        """Load what `save` wrote."""
+        """Load a policy that `save` wrote.
+
+        Args:
+            path: The file ``.safetensors``, or another form that `cfp.load` takes.
+            device: Device of its tensors.
+
+        Raises:
+            cfp.CheckpointError: The file is missing, damaged, or not such a policy.
+        """
         tensors, description = read_policy(path, device)
         with report_mismatch(path):
             size = description["inputs"], description["resolution"]
@@ -131,10 +153,23 @@ class StatePolicy(StateBasedPolicy):
 
 
 class Shac(Resumable, UpdateLoop):
-    """Actor and critic on windows of differentiable simulation.
+    """Short-horizon actor-critic (SHAC; Xu et al., ICLR 2022), which acts on the state of the simulation.
 
-    The actor maximises the discounted rewards of a window plus the target critic's value of its end, through the
-    simulation; the critic learns TD(lambda) targets from the same window.
+    The actor maximises the discounted rewards of a window of control steps plus the target critic's value of its end,
+    by gradients through the simulation; the critic learns TD(lambda) targets from the same window. `baselines.fit`
+    trains it with evaluations and checkpoints.
+
+    Args:
+        policy: ``"NetworksPolicy"``.
+        env: A `cfp.TorchVecEnv`, in which it is trained, with the action grid of ``config``.
+        config: Options, such as those of ``Shac.preset(task, "quick")``; None only where stable-baselines3 loads a
+            saved model.
+        stage: The stage, always 1.
+        device: Device of the networks, that of the simulation.
+        _init_setup_model: Make the networks at once; stable-baselines3 passes False to load a saved model.
+
+    Raises:
+        TypeError: ``env`` is not a `cfp.TorchVecEnv`.
     """
 
     sees: ClassVar[Sees] = "state"

@@ -8,7 +8,15 @@ from cfp import train
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line entry; returns the exit code."""
+    """Train as the command ``torchmpm train`` does, also algorithms and tasks that this program registered.
+
+    Args:
+        arguments: Words of the command line, such as ``["--algo", "shac", "--task", "run"]``; None for those of the
+            program.
+
+    Returns:
+        The exit code, 0 for success.
+    """
     return train.main(arguments, "baselines.train")
 
 

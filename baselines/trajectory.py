@@ -51,31 +51,31 @@ def cosine_decay(progress: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class GradientConfig(OptimisationConfig):
-    """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
+    """Options of open-loop gradient descent, whose iterations simulate num_envs episodes on fixed particle layouts.
 
-    The environment options say where the actions are evaluated; train_particles and train_dt, where they are optimised.
+    The environment options apply to evaluations, train_particles and train_dt to the simulations in training.
     """
 
     algo: str = "gradient"
-    """Which algorithm."""
+    """Name of the algorithm."""
     iterations: int = 150
     """Updates in the first stage."""
     grid: Grid = 16
-    """Action grid R: coarse, fine (the task's), or a number."""
+    """Action grid R of the first stage: coarse or fine (the task's), or a number."""
     learning_rate: float = 0.05
-    """Adam's step size at the beginning; a cosine takes it to a tenth."""
+    """Adam's step size at the beginning; it falls to a tenth along a cosine."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
     train_particles: Particles = "lite"
     """Particles of the simulation in the first stage."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
-    """SHAPE MATCH: standard deviations, in pixels, of the blur of both pictures, one after the other."""
+    """Standard deviations, in pixels, of the blur of both pictures in SHAPE MATCH, used one after the other."""
     polish: int = 0
     """Updates in a second stage, on the particles and the one layout of this seed on which it is evaluated."""
     polish_grid: Grid = "fine"
-    """Its action grid."""
+    """Action grid R of the second stage."""
     polish_learning_rate: float = 0.05
-    """Its learning rate."""
+    """Adam's step size at the beginning of the second stage."""
 
     changeable: ClassVar[tuple[str, ...]] = ("polish", "polish_grid", "polish_learning_rate", *RunConfig.changeable)
 
@@ -149,12 +149,21 @@ class Iteration(NamedTuple):
 
 
 class Gradient(Resumable, OpenLoopLearner):
-    """Adam on the actions of a whole episode, through the simulation.
+    """Optimises the actions of a whole episode by Adam, with gradients through the simulation.
 
-    Actions are ``tanh(theta)``; theta (T, 2, R, R) starts at zero. Steps after the end of an episode do not count. An
-    iteration whose loss, gradient or state is not finite, whose gradient is zero, or whose loss is far above the best
-    one (a robot that breaks into pieces has no way back), is undone: theta returns to the best point under the present
-    blur, Adam's momentum is reset, and the learning rate falls for good.
+    Actions are ``tanh(theta)``, where theta (T, 2, R, R) starts at zero. Steps after the end of an episode do not
+    count. An iteration is undone if its loss, gradient or state is not finite, if its gradient is zero, or if its loss
+    is far above the best one, as a robot that breaks into pieces has no way back: theta then returns to the best point
+    under the present blur, Adam's momentum is reset, and the learning rate is reduced for good. `baselines.fit` trains
+    all stages.
+
+    Args:
+        config: Options, such as those of ``Gradient.preset(task, "quick")``.
+        stage: The stage, 1 or 2.
+        start: Actions with which to begin; None for zero actions.
+
+    Raises:
+        cfp.ConfigError: The reward of the task has no gradient in the actions.
     """
 
     sees: ClassVar[Sees] = "nothing"

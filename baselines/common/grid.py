@@ -35,7 +35,7 @@ class GridConfig(RunConfig):
     """Options of a run on one action grid."""
 
     grid: Grid = "coarse"
-    """Action grid R: coarse, fine (the task's), or a number."""
+    """Action grid R: coarse or fine (the task's), or a number."""
 
     def resolution(self, stage: int) -> int:
         """Action grid R."""
@@ -50,7 +50,7 @@ class GridConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OptimisationConfig(GridConfig):
-    """A run that optimises actions in simulations with fewer particles or longer substeps than it is evaluated with."""
+    """Options of a run that optimises actions in simulations that are cheaper than those of evaluations."""
 
     train_particles: Particles | None = None
     """Particles of the simulations in training, at most the environment's; None: as many."""

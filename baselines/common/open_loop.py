@@ -18,14 +18,25 @@ from cfp.policy import Memory, Observation, Start, read_policy, report_mismatch,
 
 
 class OpenLoop(Shareable):
-    """Plays a sequence of actions from the beginning of an episode; after the last one its actions are zero.
+    """A policy that plays a sequence of actions from the beginning of an episode, and zero actions after the last one.
 
     Args:
-        actions: (T, 2, R, R), in [-1, 1].
-        description: What it is and comes from.
+        actions: (T, 2, R, R) in [-1, 1].
+        description: What it is and where it comes from, see `cfp.policy.Policy.description`; None for nothing.
+
+    Attributes:
+        actions: (T, 2, R, R) float32 on the CPU.
+        description: What it is and where it comes from.
 
     Raises:
-        ValueError: The actions have another shape.
+        ValueError: ``actions`` has another shape.
+
+    Examples:
+        >>> import baselines, dittogym, torch
+        >>> policy = baselines.OpenLoop(torch.zeros(30, 2, 8, 8))
+        >>> env = dittogym.TorchEnv("shapematch", resolution=policy.resolution, particles=300, substeps=10)
+        >>> len(env.film(policy, max_steps=3).rewards)
+        3
     """
 
     deterministic_by_default = True
@@ -39,22 +50,22 @@ class OpenLoop(Shareable):
 
     @property
     def resolution(self) -> int:
-        """Action grid R."""
+        """R, rows and columns of its actions."""
         return self.actions.shape[-1]
 
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Memory]:
-        """Actions for the next step, as stable-baselines3's ``predict`` of a policy with memory.
+        """Return the actions of the next step, with the signature of stable-baselines3's ``predict``.
 
         Args:
             observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
-            state: What the last call returned, None at the beginning: the number of the step, (B,).
-            episode_start: (B,) bool, which elements begin anew.
-            deterministic: Changes nothing.
+            state: Memory that the last call returned, the number of the next step (B,); None at the beginning.
+            episode_start: (B,) bool, true for elements that begin anew.
+            deterministic: Without effect.
 
         Returns:
-            Actions (B, 2, R, R), or (2, R, R) for one image, and the memory for the next step.
+            Actions (B, 2, R, R) float32, or (2, R, R) for one image, and the memory for the next call.
         """
         single = isinstance(observation, np.ndarray) and observation.ndim == 3
         count = 1 if single else len(observation)
@@ -67,43 +78,68 @@ class OpenLoop(Shareable):
         return actions[0] if single else actions, (step + 1,)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
+        """Write the policy to a file ``.safetensors``, and its description to a file ``.json`` beside it.
+
+        Args:
+            path: The file, whose name ends in ``.safetensors``.
+
+        Raises:
+            cfp.ConfigError: ``path`` has another suffix, or ``description`` is not complete, as it is for a policy that
+                comes from no run.
+        """
         write_policy(path, {"actions": self.actions}, self.description)
 
     @classmethod
     def load(cls, path: Path) -> OpenLoop:
-        """Load what `save` wrote; a `CheckpointError` if it is missing, damaged, or not such a policy."""
+        """Load a policy that `save` wrote.
+
+        Args:
+            path: The file ``.safetensors``, or another form that `cfp.load` takes.
+
+        Raises:
+            cfp.CheckpointError: The file is missing, damaged, or not such a policy.
+        """
         tensors, description = read_policy(path)
         with report_mismatch(path):
             return cls(tensors["actions"], description)
 
 
 class OpenLoopLearner(Learner):
-    """A planner or an optimiser of actions; its policy is a sequence of actions, and no network is trained."""
+    """Base class of planners and optimisers of actions, whose policy is a `baselines.OpenLoop`; no network is trained.
 
-    finished: bool = False  # whether the episode is over before the last step
+    Subclasses implement `update`, `trained_policy` and the other abstract methods of `cfp.learner.Learner`.
+
+    Attributes:
+        finished: Whether the episode is over before the last step, which ends `learn`.
+    """
+
+    finished: bool = False
 
     @property
     def trained_policy(self) -> OpenLoop:
-        """The sequence so far."""
+        """The sequence of actions so far."""
         raise NotImplementedError
 
     @property
     def progress(self) -> float:
-        """Fraction of the stage that is done, 0 to 1."""
+        """Fraction of the stage that is done, from 0 to 1."""
         return min(self.num_timesteps / self.config.stage_steps(self.stage), 1.0)
 
     def update(self) -> Scalars:
-        """Take some environment steps, add them to `num_timesteps`, and return scalars to log."""
+        """Take some environment steps, and add their number to ``num_timesteps``.
+
+        Returns:
+            Scalars to log, by name; None for values that do not exist yet.
+        """
         raise NotImplementedError
 
     @property
     def logger(self) -> Logger:
-        """Where scalars go."""
+        """Where scalars are logged, a logger of stable-baselines3."""
         return self._logger
 
     def set_logger(self, logger: Logger) -> None:
-        """Set where scalars go."""
+        """Set where scalars are logged, a ``logger`` of stable-baselines3."""
         self._logger = logger
 
     def learn(
@@ -114,9 +150,13 @@ class OpenLoopLearner(Learner):
         *,
         reset_num_timesteps: bool = True,
     ) -> None:
-        """Take at least ``total_timesteps`` more environment steps, with the callbacks of stable-baselines3.
+        """Call `update` until the steps are taken or the episode is over.
 
-        ``log_interval`` and ``reset_num_timesteps`` have no effect: callbacks write the rows, and steps are counted on.
+        Args:
+            total_timesteps: Environment steps to take at least.
+            callback: A callback of stable-baselines3; the callbacks of a run log, evaluate and write checkpoints.
+            log_interval: Without effect: callbacks write the rows of the logs.
+            reset_num_timesteps: Without effect: steps are counted on.
         """
         callback.init_callback(cast(BaseAlgorithm, self))
         callback.on_training_start(locals(), globals())
@@ -130,5 +170,5 @@ class OpenLoopLearner(Learner):
 
     @classmethod
     def load_policy(cls, path: Path, device: str = "cpu") -> OpenLoop:
-        """Load actions."""
+        """Load a policy that ``save_policy`` wrote to ``path``; ``device`` has no effect."""
         return OpenLoop.load(path)

@@ -44,10 +44,13 @@ class StateBasedPolicy(Shareable, ABC):
         """Number of features that a task has."""
 
     def attached(self, env: TorchEnv) -> StateBasedPolicy:
-        """Return the same policy, acting on the state of the environment ``env``.
+        """Return the same policy, acting on the state of an environment.
+
+        Args:
+            env: The environment; that of a Gymnasium environment is ``env.unwrapped.torch_env``.
 
         Raises:
-            TypeError: It is no `dittogym.TorchEnv`; a Gymnasium environment has one, ``env.unwrapped.torch_env``.
+            TypeError: ``env`` is not a `dittogym.TorchEnv`.
             ValueError: The environment is of a task with another number of features.
         """
         checks.instance("env", env, TorchEnv)
@@ -64,16 +67,16 @@ class StateBasedPolicy(Shareable, ABC):
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Memory]:
-        """Choose actions for the present state of the attached environment, as stable-baselines3's ``predict``.
+        """Choose actions for the present state of the attached environment, with the signature of stable-baselines3.
 
         Args:
             observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
-            state: Memory returned by the last call, None at the beginning; arrays with a leading B.
+            state: Memory that the last call returned, arrays with a leading B; None at the beginning.
             episode_start: (B,) bool; ignored, as the environment knows which of its episodes begin.
-            deterministic: Without noise.
+            deterministic: Act without noise.
 
         Returns:
-            Actions (B, 2, R, R), or (2, R, R) for a single image, and the memory for the next step.
+            Actions (B, 2, R, R) float32, or (2, R, R) for a single image, and the memory for the next call.
 
         Raises:
             RuntimeError: The policy was not attached to an environment.

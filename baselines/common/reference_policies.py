@@ -28,11 +28,19 @@ REFERENCE_POLICIES: dict[str, Callable[[RunConfig], Policy]] = {
 
 
 def wave(steps: int, size: int, action_layout: ActionLayout) -> Tensor:
-    """The actions with which the reference figures of the tasks were recorded, (T, 2, R, R).
+    """Return the actions of a travelling wave, the reference policy ``scripted``.
 
-    In step t = 1, 2, ... the muscle of direction c in column x and row y of the action grid, counted to the right and
-    upwards, is driven with ``sin(0.3 t + 0.7 x + 1.1 y + 2 c)``, the same in the world whatever the layout of the
-    action array.
+    In step t = 1, 2, ... the muscle of direction c = 0, 1 in column x and row y of the action grid, counted to the
+    right and upwards from 0, is driven with ``sin(0.3 t + 0.7 x + 1.1 y + 2 c)``; in the world this is the same in both
+    layouts.
+
+    Args:
+        steps: T, the number of control steps.
+        size: R, rows and columns of the action grid.
+        action_layout: Layout of the actions, ``"image"`` or ``"grid"``, see :class:`dittogym.TorchEnv`.
+
+    Returns:
+        (T, 2, R, R) float32 in [-1, 1], such as `baselines.OpenLoop` takes.
     """
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)

@@ -15,12 +15,19 @@ from dittogym.action import ActionLayout, to_grid_layout
 from dittogym.core import EnvState, Model, StepResult
 from torchmpm import trajectory
 
-#: From the task, a state and actions (B, 2, R, R) in the layout ``"grid"``, such as :func:`dittogym.core.step`.
+#: A function of a model, a state and actions (B, 2, R, R) in the layout ``"grid"``, such as
+#: :func:`dittogym.core.step`, which returns the result of a control step.
 StepFunction: TypeAlias = Callable[[Model, EnvState, Tensor], StepResult]
 
 
 def soft_step(model: Model, state: EnvState, action: Tensor) -> StepResult:
-    """A step with the task's smooth reward."""
+    """Advance by one control step with the task's smooth reward.
+
+    Args:
+        model: The task.
+        state: The present state.
+        action: (B, 2, R, R) in the layout ``"grid"``.
+    """
     return core.step(model, state, action, soft=True)
 
 
@@ -31,13 +38,13 @@ def check_differentiable(env: TorchEnv) -> None:
 
 
 class Rollout(NamedTuple):
-    """Some control steps of B simulations. After its end a simulation earns nothing more, as in an episode.
+    """Some control steps of B simulations; once its episode has ended, a simulation earns nothing more.
 
     Attributes:
-        state: After the last step.
-        rewards: (T, B) to differentiate.
-        true_rewards: (T, B) the task's own.
-        ended: (B,) bool, whether the episode has ended.
+        state: The state after the last step.
+        rewards: (T, B) rewards to differentiate, by default the smooth ones.
+        true_rewards: (T, B) exact rewards of the task, without gradient.
+        ended: (B,) bool, whether the task ended the episode.
     """
 
     state: EnvState
@@ -55,15 +62,31 @@ def rollout(
     action_layout: ActionLayout = "image",
     checkpointed: bool = True,
 ) -> Rollout:
-    """Drive simulations through some control steps.
+    """Drive simulations through some control steps, with gradients in bounded memory.
 
     Args:
-        model: The task, such as ``TorchEnv.model``.
-        start: Where the simulations start, B of them.
-        actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
-        step: Advances the simulations; by default the reward is the smooth one.
-        action_layout: Of the actions, see :class:`dittogym.TorchEnv`.
+        model: The task, such as ``env.model``.
+        start: State of B simulations at the start, such as ``env.env_state``.
+        actions: (T, B, 2, R, R) in [-1, 1].
+        step: What advances the simulations; by default the reward is the smooth one.
+        action_layout: Layout of the actions, ``"image"`` or ``"grid"``, see :class:`dittogym.TorchEnv`.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
+
+    Returns:
+        The last state and all rewards, differentiable in actions and start.
+
+    Raises:
+        ValueError: ``actions`` has another shape or dtype.
+
+    Examples:
+        >>> import dittogym, torch
+        >>> from baselines.common.rollout import rollout
+        >>> env = dittogym.TorchEnv("run", num_envs=2, particles=300, substeps=10)
+        >>> observation, info = env.reset(seed=0)
+        >>> actions = torch.zeros(5, 2, *env.action_shape, requires_grad=True)
+        >>> rollout(env.model, env.env_state, actions).rewards.sum().backward()
+        >>> actions.grad.shape
+        torch.Size([5, 2, 2, 8, 8])
     """
 
     def advance(before: _Step, action: Tensor) -> _Step:

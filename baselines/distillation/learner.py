@@ -62,26 +62,27 @@ METRICS: dict[str, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class DistillConfig(GradientPlannerConfig, StagedConfig):
-    """A distillation; num_envs robots move side by side. Stages are listed coarsest first.
+    """Options of a distillation, in which num_envs robots move side by side.
 
-    The environment options say where the student is evaluated; train_particles, where it is taught. The options of
-    planning, from horizon to clip, and planner_grid are those of the teacher mpc, and refused with others.
+    The environment options apply to evaluations of the student, train_particles to its training. The options of
+    planning, those of baselines.GradientPlannerConfig and planner_grid, apply to the teacher mpc, and are refused with
+    others.
     """
 
     algo: str = "distill"
-    """Which algorithm."""
+    """Name of the algorithm."""
     teacher: str = "shac"
-    """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
+    """Teacher: mpc (plans from every state), shac or gradient (trained first), or a policy (a run folder or a file)."""
     train_particles: Particles = "lite"
     """Particles of the simulations in training."""
     rollout_steps: int = 64
-    """Control steps of a round, after which the student is updated."""
+    """Control steps of each robot in a round, after which the student is updated."""
     updates: int = 48
-    """Gradient steps after a round."""
+    """Gradient steps after each round."""
     batch_size: int = 256
     """Labels in a gradient step."""
     student_noise: bool = True
-    """The student acts with the noise of its policy."""
+    """Whether the student acts with the noise of its policy."""
     student_learning_rate: float = 1e-3
     """Adam's step size at the beginning of each stage; it falls to a tenth."""
     max_grad_norm: float = 1.0
@@ -89,14 +90,14 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     beta_decay: float = 0.7
     """Factor by which beta, the probability that the teacher acts, falls from round to round; it starts at 1."""
     dropout: float = 0.0
-    """Probability with which entries of the student's observations and actions are set to 0, in half of them, so that
-    it learns to do without."""
+    """Probability with which entries are set to 0 in half of the student's observations and actions, so that it learns
+    to do without them."""
     max_episode_steps: int = 400
-    """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
+    """Control steps after which training episodes end, the first ones at staggered times."""
     num_layouts: int = 64
     """Particle layouts that training episodes start from in turn; in GROW and OBSTACLE all are the same."""
     planner_grid: Grid = "coarse"
-    """Action grid of the teacher mpc."""
+    """Action grid of the teacher mpc: coarse or fine (the task's), or a number."""
 
     @property
     def planner_resolution(self) -> int:
@@ -258,12 +259,26 @@ def teacher_path(folder: Path) -> Path:
 
 
 class Distill(Resumable, UpdateLoop, CoarseToFine):
-    """Supervised learning of the teacher's actions in the states that the student visits, by DAgger.
+    """Teaches the networks of the coarse-to-fine policy to imitate a teacher that sees more than the image.
 
-    The mean action is learned, by least squares after tanh: small differences in the muscles cost little. The standard
-    deviation stays 0.105 before tanh, so that the policy can be evaluated with noise, and refined by soft actor-critic.
+    This is dataset aggregation (DAgger; Ross et al., AISTATS 2011): student and teacher act, and the teacher labels the
+    states that are visited. The student's mean action is fitted to the labels by least squares after tanh, so that
+    small differences in the muscles cost little. Its standard deviation stays 0.105 before tanh, so that the policy can
+    be evaluated with noise, and refined by soft actor-critic. `baselines.fit` trains all stages.
 
-    Its arguments are those of `cfp.learner.UpdateLoop`.
+    Args:
+        policy: ``"NetworksPolicy"``.
+        env: A `cfp.TorchVecEnv`, in which it is trained. Its actions have the size ``config.action_size(stage)``.
+        config: Options, such as those of ``Distill.preset(task, "quick")``; None only where stable-baselines3 loads a
+            saved model.
+        stage: The stage that it learns, 1 for the coarsest.
+        device: Device of the networks, that of the simulation.
+        _init_setup_model: Make the networks at once; stable-baselines3 passes False to load a saved model.
+
+    Raises:
+        TypeError: ``env`` is not a `cfp.TorchVecEnv`.
+        cfp.CheckpointError: The file of the teacher is missing, damaged, or not a policy.
+        cfp.ConfigError: The teacher does not go with task, environment or options.
     """
 
     config: DistillConfig

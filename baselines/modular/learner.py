@@ -23,19 +23,18 @@ from dittogym import make_spec
 
 @dataclass(frozen=True, kw_only=True)
 class ModularConfig(LearningConfig, RunConfig):
-    """A run of a modular policy; ``algo`` names its network and the number of segments of the robot."""
+    """Options of a modular policy, trained by soft actor-critic."""
 
     algo: str = "gnn-16"
-    """Which algorithm."""
+    """Kind of the networks, gnn or transformer, and number of segments of the robot, such as gnn-16."""
     steps: int = 20_000
     """Environment steps of all robots together."""
     random_steps: int = 500
-    """Uniformly random environment steps at the start."""
+    """Environment steps with uniformly random actions at the start."""
     alpha: float = 0.01
     """Entropy temperature."""
     max_episode_steps: int | None = None
-    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
-    different ages. None: the horizon, and all begin together."""
+    """Control steps after which training episodes end, the first ones at staggered times; None: all at the horizon."""
     critics_first: float = 0.0
     """Share of the steps in which only the critics learn."""
 

@@ -109,15 +109,15 @@ class ModularCritics(nn.Module):
 
 
 class SegmentPolicy(StateBasedPolicy):
-    """Acts on the segments of the robots in the environment given to `attached`, not on the image.
+    """A modular policy, which acts on segments of the robot instead of the image; `baselines.load` returns one.
 
-    Its memory is the segmentation: pass the second result of `predict` back as ``state``, or robots are segmented anew
-    in every step.
+    It acts in the environment that is given to `attached`. Its memory is the segmentation: pass the second result of
+    `predict` to the next call as ``state``, or robots are segmented anew in every step.
 
     Args:
         actor: The network.
-        nodes: Features and actions of segments.
-        description: What it is and where it comes from, see `cfp.policy.describe_run`.
+        nodes: What it reads of segments, and how they act.
+        description: What it is and where it comes from, see `cfp.policy.Policy.description`.
     """
 
     def __init__(self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None) -> None:
@@ -126,7 +126,7 @@ class SegmentPolicy(StateBasedPolicy):
 
     @property
     def resolution(self) -> int:
-        """Action grid R of the environment that it acts in."""
+        """R, rows and columns of its actions, which is the task's patch."""
         return int(self.description["resolution"])
 
     @property
@@ -152,7 +152,15 @@ class SegmentPolicy(StateBasedPolicy):
         return from_grid_layout(action, trained_layout(self) or env.action_layout), (labels.cpu().numpy(),)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
+        """Write the policy to a file ``.safetensors``, and its description to a file ``.json`` beside it.
+
+        Args:
+            path: The file, whose name ends in ``.safetensors``.
+
+        Raises:
+            cfp.ConfigError: ``path`` has another suffix, or ``description`` is not complete, as it is for a policy that
+                comes from no run.
+        """
         trunk = self.actor.trunk
         network = {"kind": trunk.kind, "features": trunk.features}
         own = {"nodes": dataclasses.asdict(self.nodes), "network": network}
@@ -160,7 +168,15 @@ class SegmentPolicy(StateBasedPolicy):
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
-        """Load what `save` wrote; a `CheckpointError` if it is missing, damaged, or not such a policy."""
+        """Load a policy that `save` wrote.
+
+        Args:
+            path: The file ``.safetensors``, or another form that `cfp.load` takes.
+            device: Device of its tensors.
+
+        Raises:
+            cfp.CheckpointError: The file is missing, damaged, or not such a policy.
+        """
         tensors, description = read_policy(path, device)
         with report_mismatch(path):
             actor = load_network(lambda: ModularActor(**description["network"]), tensors, device)

@@ -119,20 +119,21 @@ def connect(edges: Tensor, distance: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Nodes:
-    """Reads a robot's segments as rows of numbers, and writes values of segments to the action grid.
+    """What a modular policy reads of the K segments of a robot, and how it writes actions of segments to the grid.
 
-    A row holds, for its segment: the centre relative to the robot's (2), mean velocity (2), standard deviation of x and
-    y (2), share of the particles times K (1), height above the floor (1). Then the surroundings: the robot's
-    displacement since the reset (2), the goal relative to the centre (2, in tasks with one), position and velocity of
-    the object relative to the segment's (4, in tasks with one that is drawn as a body: not DIG's snow). With a graph,
-    the segment's neighbours follow, packed by `pack`.
+    A segment is read as a row of numbers: its centre relative to the robot's (2), its mean velocity (2), the standard
+    deviations of its x and y (2), its share of the particles times K (1), and its height above the floor (1); then the
+    robot's displacement since the reset (2), the goal relative to the segment's centre (2, in tasks with a goal), and
+    position and velocity of the object relative to the segment's (4, in tasks with an object other than DIG's soil).
+    Lengths are in units of 0.1 m, velocities in units of 0.5 m/s. With a graph, the segment's neighbours follow, as
+    bits of whole numbers.
 
     Attributes:
-        count: Number of segments K.
-        graph: Whether rows hold neighbours.
+        count: K, the number of segments, from 2 to 4096.
+        graph: Whether rows hold the neighbours.
 
     Raises:
-        ValueError: ``count`` is below 2 or above `MAX_SEGMENTS`, or ``graph`` is not a bool.
+        ValueError: ``count`` is out of range, or ``graph`` is not a bool.
     """
 
     count: int
@@ -143,11 +144,11 @@ class Nodes:
         checks.flag("graph", self.graph)
 
     def num_features(self, spec: TaskSpec) -> int:
-        """Length of a row without neighbours in a task."""
+        """Return the length of a row without neighbours in a task."""
         return 10 + 2 * (spec.goal is not None) + 4 * _has_object(spec)
 
     def num_columns(self, spec: TaskSpec) -> int:
-        """Length of a row in a task."""
+        """Return the length of a row in a task."""
         return self.num_features(spec) + (-(-self.count // BITS) if self.graph else 0)
 
     def observe(self, env: TorchEnv, labels: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ class PlannerConfig:
     noise: float = 0.1
     """Standard deviation of the random actions that extend a plan."""
     termination_steps: float = 32.0
-    """A plan that ends the episode early is charged this many control steps at its own mean reward, if it is
+    """Control steps for which a plan that ends the episode early is charged its own mean reward, if that is
     positive."""
     split_weight: float = 1000.0
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
@@ -55,25 +55,26 @@ Config = TypeVar("Config", bound=PlannerConfig)
 
 
 class Planner(Resumable, ABC, Generic[Config]):
-    """Plans the next actions of every simulation of an environment, each simulation by itself.
+    """Base class of planners, which plan the next actions of each simulation of an environment by itself.
 
-    Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
-    everything but the conditions that disturb actions. The part of a plan that was not carried out is kept and extended
-    by noise. Of all plans met in a search, the one with the highest true return is carried out.
+    Plans are tried in the simulator that the environment itself runs on, from its present state, so that a planner sees
+    everything except the conditions that disturb actions. The part of a plan that was not carried out is kept and
+    extended by noise. Of all plans that a search evaluates, the one with the highest true return is carried out.
 
     Args:
-        env: The environment, after its reset. It is only read.
-        config: Options; the defaults if None.
-        step: Advances the simulations, by default the task's own step. The search may climb its smooth reward; its true
-            reward chooses the plan.
+        env: The environment, after its reset. It is only read: call ``env.step(planner.act())``.
+        config: Options, a `baselines.GradientPlannerConfig` or a `baselines.CEMPlannerConfig`; None for the defaults.
+        step: What advances the simulations, a `baselines.common.rollout.StepFunction`; None for the task's own step. A
+            search by gradients climbs its reward; its true reward chooses the plan.
         seed: Seed of the noise.
 
     Attributes:
-        num_plans: Plans evaluated so far.
-        num_failed: Plans so far whose return or gradient was not finite. They are never carried out.
+        num_plans: Number of plans evaluated so far.
+        num_failed: Number of plans so far whose return or gradient was not finite; they are never carried out.
 
     Raises:
-        ConfigError: An option is out of range, or gradients are to be followed in a task whose reward has none.
+        cfp.ConfigError: An option is out of range, or a search by gradients is to plan in a task whose reward has none.
+        RuntimeError: The environment was not reset yet, for a search by gradients.
     """
 
     config_type: type[Config]
@@ -98,18 +99,33 @@ class Planner(Resumable, ABC, Generic[Config]):
 
     @property
     def needs_plan(self) -> bool:
-        """Whether the next call of `act` makes a new plan."""
+        """Whether the next call of `act` makes new plans."""
         return self._step >= min(self.config.commit, len(self._plan))
 
     def act(self) -> Tensor:
-        """Next action (B, 2, R, R) of every simulation; makes new plans where the last are used up."""
+        """Return the next action of every simulation, after making new plans if the last ones are used up.
+
+        Returns:
+            (B, 2, R, R) in [-1, 1], for `dittogym.TorchEnv.step`.
+
+        Raises:
+            RuntimeError: The environment was not reset yet.
+        """
         if self.needs_plan:
             self.plan()
         self._step += 1
         return self._plan[self._step - 1]
 
     def plan(self) -> Tensor:
-        """Make new plans (T, B, 2, R, R) from the environment's present state."""
+        """Make new plans from the environment's present state.
+
+        Returns:
+            (T, B, 2, R, R) in [-1, 1], where T is the horizon of the options or, if it is smaller, the number of steps
+            to the end of the youngest episode.
+
+        Raises:
+            RuntimeError: The environment was not reset yet.
+        """
         state = tree.detach(self.env.env_state)
         remaining = self._remaining_steps(state)
         length = min(self.config.horizon, remaining) if remaining else self.config.horizon

@@ -24,7 +24,7 @@ class CEMPlannerConfig(PlannerConfig):
     candidates: int = 32
     """Plans in a generation, simulated side by side."""
     elites: int = 6
-    """Best candidates, to which the distribution of the next generation is fitted."""
+    """Number of best candidates, to which the distribution of the next generation is fitted."""
     initial_std: float = 0.5
     """Standard deviation of the actions in the first generation."""
     noise_correlation: float = 0.8
@@ -32,7 +32,7 @@ class CEMPlannerConfig(PlannerConfig):
     noise_grid: int = 4
     """Rows and columns on which noise is drawn before it is enlarged to the action grid: fewer numbers to search."""
     momentum: float = 0.1
-    """Fraction of mean and standard deviation that each generation keeps."""
+    """Fraction of mean and standard deviation that each generation keeps of the last one."""
 
     def check_planner(self, resolution: int) -> None:
         """Check what the types do not express."""
@@ -50,7 +50,18 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
 
     A generation of plans is drawn around a mean, all are simulated in one batch, and mean and standard deviation move
     to those of the best. Only true rewards are used. The first candidate of a generation is its mean, so what is kept
-    of the last plan is tried too; the second is zero action, as effort costs. Its arguments are those of `Planner`.
+    of the last plan is tried too; the second is zero action, as effort costs.
+
+    Arguments, attributes and methods are those of `baselines.planning.base.Planner`.
+
+    Examples:
+        >>> import dittogym
+        >>> from baselines import CEMPlanner, CEMPlannerConfig
+        >>> env = dittogym.TorchEnv("run", particles=300, substeps=10)
+        >>> observation, info = env.reset(seed=0)
+        >>> planner = CEMPlanner(env, CEMPlannerConfig(horizon=4, commit=2, candidates=4, elites=2), seed=0)
+        >>> planner.act().shape
+        torch.Size([1, 2, 8, 8])
     """
 
     config_type = CEMPlannerConfig

@@ -20,7 +20,7 @@ class GradientPlannerConfig(PlannerConfig):
     learning_rate: float = 0.6
     """Adam's step size on actions, which lie in [-1, 1]."""
     clip: float = 3.0
-    """Clip the gradient of a control step to this multiple of the median norm over the steps of the plan."""
+    """Largest norm of the gradient of a control step, as a multiple of the median over the steps of the plan."""
 
     def check_planner(self, resolution: int) -> None:
         """Check what the types do not express."""
@@ -29,7 +29,9 @@ class GradientPlannerConfig(PlannerConfig):
 
 
 class GradientPlanner(Planner[GradientPlannerConfig]):
-    """Improves the next actions by Adam on the smooth return; its arguments are those of `Planner`.
+    """Plans by gradients: improves the next actions by Adam on the smooth return.
+
+    Arguments, attributes and methods are those of `baselines.planning.base.Planner`.
 
     Examples:
         >>> import dittogym

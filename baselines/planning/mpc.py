@@ -37,10 +37,10 @@ METRICS: dict[str, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedConfig(PlannerConfig, OptimisationConfig):
-    """A planned episode: one robot on the layout of the seed, from the start to the end of the task.
+    """Options of an episode that is planned, with one robot on the layout of the seed.
 
-    The environment options say where plans are carried out and evaluated; train_particles and train_dt, where they are
-    tried.
+    The environment options apply to the episode that is carried out, train_particles and train_dt to the simulations in
+    which plans are tried.
     """
 
     def ends(self) -> tuple[int, ...]:
@@ -61,18 +61,18 @@ class PlannedConfig(PlannerConfig, OptimisationConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class MPCConfig(GradientPlannerConfig, PlannedConfig):
-    """An episode planned by gradients: one robot on the layout of the seed, from the start to the end of the task."""
+    """Options of an episode that is planned by gradients."""
 
     algo: str = "mpc"
-    """Which algorithm."""
+    """Name of the algorithm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CEMConfig(CEMPlannerConfig, PlannedConfig):
-    """An episode planned by the cross-entropy method: one robot on the layout of the seed, start to end of the task."""
+    """Options of an episode that is planned by the cross-entropy method."""
 
     algo: str = "cem"
-    """Which algorithm."""
+    """Name of the algorithm."""
 
 
 def planner_preset(task: str) -> tuple[GradientPlannerConfig, Grid]:
@@ -161,11 +161,17 @@ def _assign(nearest: Tensor, count: int) -> Tensor:
 
 
 class MPC(OpenLoopLearner):
-    """Model predictive control by gradients, see `GradientPlanner`.
+    """Model predictive control by gradients, see `baselines.GradientPlanner`.
 
-    There is nothing to learn: `update` carries out a planned step of a single episode, and the policy is the record of
-    its actions. On the layout of its seed the record repeats the episode; other layouts have to be planned for
-    themselves.
+    There is nothing to learn: an update carries out a planned step of a single episode, and the policy is the record of
+    its actions, a `baselines.OpenLoop`. On the layout of its seed the record repeats the episode; other layouts have to
+    be planned for themselves.
+
+    Args:
+        config: Options, such as those of ``MPC.preset(task, "quick")``.
+
+    Raises:
+        cfp.ConfigError: An option is out of range, or the reward of the task has no gradient in the actions.
     """
 
     sees: ClassVar[Sees] = "simulator"
@@ -238,7 +244,14 @@ class MPC(OpenLoopLearner):
 
 
 class CEM(MPC):
-    """Model predictive control by the cross-entropy method, see `CEMPlanner`; otherwise the same as `MPC`."""
+    """Model predictive control by the cross-entropy method, see `baselines.CEMPlanner`; else as `baselines.MPC`.
+
+    Args:
+        config: Options, such as those of ``CEM.preset(task, "quick")``.
+
+    Raises:
+        cfp.ConfigError: An option is out of range.
+    """
 
     planner_type: ClassVar[type[Planner[Any]]] = CEMPlanner
 
