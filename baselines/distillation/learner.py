@@ -65,8 +65,8 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Options of a distillation, in which num_envs robots move side by side.
 
     The environment options apply to evaluations of the student, train_particles to its training. The options of
-    planning, those of baselines.GradientPlannerConfig and planner_grid, apply to the teacher mpc, and are refused with
-    others.
+    planning (horizon, commit, noise, termination_steps, split_weight, iterations, learning_rate, clip, planner_grid)
+    apply to the teacher mpc, and are refused with others.
     """
 
     algo: str = "distill"
