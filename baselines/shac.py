@@ -86,7 +86,7 @@ class StatePolicy(StateBasedPolicy):
     """A policy that acts on the state of the simulation instead of the image; `baselines.load` returns one.
 
     It acts in the environment that is given to `attached`. It reads mass, momentum and deformation of the robot, and
-    mass and momentum of an object, on 16 x 16 cells of the action patch, and the time.
+    mass and momentum of an object, on 16 x 16 cells of the action patch, and a clock of control steps.
 
     Args:
         actor: The network.
