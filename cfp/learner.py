@@ -246,6 +246,8 @@ class UpdateLoop(BaseAlgorithm, Learner):
         self.config, self.stage = config, stage
         self.progress = 0.0
         if _init_setup_model:
+            if config is None:
+                raise TypeError("config must be the options of a training, such as cfp.preset(task), got None")
             self._setup_model()
 
     @property

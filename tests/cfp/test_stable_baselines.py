@@ -100,6 +100,11 @@ def test_gradients_need_an_environment_in_torch():
         CFPAnalytic("NetworksPolicy", env, CONFIG, device="cpu")
 
 
+def test_learners_by_gradients_need_their_options():
+    with pytest.raises(TypeError, match="config must be .* got None"):
+        CFPAnalytic("NetworksPolicy", make_env(), device="cpu")
+
+
 @pytest.mark.parametrize("algorithm", [CFP, CFPAnalytic])
 @pytest.mark.parametrize("with_env", [True, False])
 def test_saved_model_acts_the_same_and_learns_on(algorithm, with_env, tmp_path):
