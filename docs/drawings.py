@@ -220,8 +220,11 @@ def draw_rewards() -> None:
             trainings.setdefault(row["task"], {}).setdefault((row["seed"], row["change"]), []).append(point)
     figure = Figure(figsize=(8.6, 4.2), layout="constrained")
     for axes, task in zip(figure.subplots(2, 4).flat, paper.CURVES, strict=True):
-        for points in trainings[task].values():
-            axes.plot(*zip(*points, strict=True), color=OURS, lw=1.2, marker=".", ms=4)
+        lines = list(trainings[task].values())
+        for points in lines:
+            axes.plot(*zip(*points, strict=True), color=OURS, lw=0.7, alpha=0.5)
+        shared = [np.mean(points, axis=0) for points in zip(*lines, strict=False)]  # as far as the shortest
+        axes.plot(*zip(*shared, strict=True), color=OURS, lw=1.5, marker=".", ms=5)
         zero = float(evaluated(task, "zero", UNDISTURBED, "lite")["mean"])
         axes.axhline(zero / 1000, color=ZERO, lw=1)
         axes.axhline(paper.CURVES[task][0][0] / 1000, color=PAPER, lw=1, ls="--")
@@ -232,12 +235,13 @@ def draw_rewards() -> None:
     figure.supxlabel("thousand steps", fontsize=9)
     figure.supylabel("return, thousands", fontsize=9)
     entries = [
-        Line2D([], [], marker=".", lw=1.2, color=OURS, label="coarse stage of each training, 2,000 particles"),
+        Line2D([], [], color=OURS, lw=0.7, alpha=0.5, label="coarse stage of each training, 2,000 particles"),
+        Line2D([], [], marker=".", lw=1.5, ms=5, color=OURS, label="mean"),
         Line2D([], [], color=PAPER, lw=1, ls="--", label="paper's CFP"),
         Line2D([], [], color=PAPER, lw=1, ls=":", label="paper's coarse policy"),
         Line2D([], [], color=ZERO, lw=1, label="zero actions"),
     ]
-    figure.legend(handles=entries, loc="outside upper center", ncols=4, frameon=False)
+    figure.legend(handles=entries, loc="outside upper center", ncols=5, columnspacing=1.2, frameon=False)
     save(figure, "rewards.svg")
 
 
