@@ -87,8 +87,7 @@ class Command:
     """
 
     policies: tyro.conf.Positional[tuple[str, ...]]
-    """Run folders, policy files, names of policies that come with the package, hf://OWNER/NAME, the reference policies
-    zero, random and scripted, or files of results (.json)."""
+    """Run folders, policy files, pretrained policies, hf://OWNER/NAME, zero, random, scripted, or results (.json)."""
     tasks: tuple[str, ...] = TASKS
     """Where the reference policies act."""
     out: Folder = Path("runs/leaderboard")

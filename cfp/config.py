@@ -51,8 +51,7 @@ class EnvironmentConfig:
     action_layout: ActionLayout = "image"
     """Orientation of the action array: image (as the observation) or grid (the reference's)."""
     resample: bool = False
-    """Draw the particles anew at every reset; only with soft actor-critic, and without effect in GROW and OBSTACLE,
-    whose starts are alike."""
+    """Draw the particles anew at every reset; soft actor-critic only, and without effect in GROW and OBSTACLE."""
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: str | None = None
@@ -502,13 +501,11 @@ class WindowConfig(RunConfig):
     max_episode_steps: int = 400
     """Control steps after which training episodes end, the first ones at staggered times; at most the horizon."""
     num_layouts: int = 16
-    """Particle layouts that training episodes start from in turn, under varied conditions as many as episodes; in
-    GROW and OBSTACLE all are the same."""
+    """Particle layouts from which training episodes start in turn; no effect in GROW and OBSTACLE, or with vary."""
     reward: Literal["task", "speed"] = "task"
     """Training reward: task (its own, made smooth) or speed (60 per m/s to the right, less the cost of action)."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of the amount by which spread / limit exceeds split_margin; no
-    effect in tasks without a limit, such as SHAPE MATCH."""
+    """Weight of the cost of a large spread: the square of the amount by which spread / limit exceeds split_margin."""
     split_margin: float = 0.85
     """Fraction of the limit above which the spread costs."""
     integrity_weight: float = 300.0
@@ -518,8 +515,7 @@ class WindowConfig(RunConfig):
     reward_scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward of each step in which the task is solved, which the critic values; an episode that ends with success is
-    valued as if it went on so for 1 / (1 - gamma) steps, at most 100. 0: none."""
+    """Reward of each step in the goal; success that ends an episode earns it for 1 / (1 - gamma) steps, at most 100."""
 
     def check(self) -> None:
         """Check what the types do not express."""

@@ -58,8 +58,7 @@ class Command:
     json: bool = False
     """Print JSON instead of a table."""
     video: Path | None = None
-    """Also film one episode of the last stage's policy, with noise if --noise is both: a file .mp4, .gif or .webp, or
-    .png for a row of pictures."""
+    """Also film an episode of the last stage's policy, with noise if --noise is both: .mp4, .gif, .webp or .png."""
     replay: Path | None = None
     """Also write one episode of it as a page (.html) that plays in any browser."""
     record: Path | None = None

@@ -74,11 +74,9 @@ class Command:
     """
 
     policies: tyro.conf.Positional[tuple[str, ...]]
-    """Run folders, policy files, names of policies that come with the package, or hf://OWNER/NAME. Rows have the name
-    of the folder or of the file."""
+    """Run folders, policy files, pretrained policies, or hf://OWNER/NAME; rows are named by the folder or file."""
     rows: Path | None = None
-    """A table of evaluations (.csv) to put the results into. Rows that it has, of the same policy file and as many
-    episodes, are kept, so that an evaluation that was stopped goes on; those of another file of that name are not."""
+    """Table (.csv) for the results; rows of the same policy file and number of episodes are kept, not played again."""
     episodes: int = 100
     """Undisturbed episodes with lite particles."""
     full: int = 20

@@ -10,7 +10,11 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
+import docstring_parser
 import pytest
+
+import baselines
+from cfp import registry
 
 PACKAGES = ("torchmpm", "dittogym", "cfp", "baselines")
 REFERENCE = Path(__file__).resolve().parents[1] / "docs/reference"
@@ -55,6 +59,28 @@ def test_docstrings_mention_the_arguments(package: str) -> None:
                     # ``solver: Solver`` needs no words
                     plain = argument in ("self", "cls") or argument.title() in str(about.annotation)
                     assert plain or re.search(rf"\b{argument}\b", text), f"{path}: {argument}"
+
+
+COMMANDS = (
+    "cfp.evaluate",
+    "cfp.robustness",
+    "cfp.play.__main__",
+    "baselines.leaderboard",
+    "baselines.compare.__main__",
+)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *(importlib.import_module(name).Command for name in COMMANDS),
+        *dict.fromkeys(type(registry.find(name).preset("shapematch", "quick")) for name in baselines.ALGORITHMS),
+    ],
+)
+def test_options_are_described_in_one_line(options: type) -> None:
+    for base in options.__mro__[:-1]:  # the help would break the text where its second line begins
+        for about in docstring_parser.parse_from_object(base).params:
+            assert "\n" not in (about.description or ""), f"{base.__name__}: {about.arg_name}"
 
 
 @pytest.mark.parametrize("package", PACKAGES)

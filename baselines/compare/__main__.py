@@ -56,8 +56,7 @@ class Command:
     particles: Literal["full", "lite"] | int = "lite"
     """Particles of the final evaluation, for all policies."""
     noise: Literal["paper", "with", "without"] = "paper"
-    """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
-    SHAPE MATCH and with it in all other tasks."""
+    """Action noise of all policies in the final evaluation; paper: without in SHAPE MATCH, with it in other tasks."""
     workers: int = 1
     """Runs at a time, each in a process of its own; on a cluster Ray decides."""
     cpus_per_run: int | None = None

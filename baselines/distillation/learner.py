@@ -90,8 +90,7 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     beta_decay: float = 0.7
     """Factor by which beta, the probability that the teacher acts, falls from round to round; it starts at 1."""
     dropout: float = 0.0
-    """Probability with which entries are set to 0 in half of the student's observations and actions, so that it learns
-    to do without them."""
+    """Probability with which entries are set to 0 in half of the student's observations and actions in training."""
     max_episode_steps: int = 400
     """Control steps after which training episodes end, the first ones at staggered times."""
     num_layouts: int = 64

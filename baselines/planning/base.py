@@ -33,11 +33,9 @@ class PlannerConfig:
     noise: float = 0.1
     """Standard deviation of the random actions that extend a plan."""
     termination_steps: float = 32.0
-    """Control steps for which a plan that ends the episode early is charged its own mean reward, if that is
-    positive."""
+    """Control steps for which a plan that ends the episode early is charged its mean reward, if that is positive."""
     split_weight: float = 1000.0
-    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
-    exceeds 0.8; no effect in tasks without a limit, such as SHAPE MATCH."""
+    """Weight of the cost of a large spread: the square of the amount by which spread / limit exceeds 0.8."""
 
     def check_planner(self, resolution: int) -> None:
         """Check what the types do not express, for plans on an action grid of ``resolution`` rows and columns.

@@ -31,8 +31,7 @@ class Command:
     task: tyro.conf.Positional[str | None] = None
     """A task, or MODULE:NAME for a custom one; without it the task of the policy, else run."""
     policy: str | None = None
-    """A pretrained policy by name, a policy file, or a run folder; it acts at once. Pretrained policies for the task
-    can also be chosen on the page."""
+    """Policy that acts at once: a pretrained one by name, a policy file, or a run folder; the page offers others."""
     particles: Literal["full", "lite"] | int = "lite"
     """Particles: lite (about 2,000), full (the paper's), or a number."""
     resolution: Literal["coarse", "fine"] | int = "fine"

@@ -101,7 +101,7 @@ def test_gradients_need_an_environment_in_torch():
 
 
 def test_learners_by_gradients_need_their_options():
-    with pytest.raises(TypeError, match="config must be .* got None"):
+    with pytest.raises(TypeError, match=r"config must be .* got None"):
         CFPAnalytic("NetworksPolicy", make_env(), device="cpu")
 
 
