@@ -169,7 +169,7 @@ class Shac(Resumable, UpdateLoop):
         _init_setup_model: Make the networks at once; stable-baselines3 passes False to load a saved model.
 
     Raises:
-        TypeError: ``env`` is not a `cfp.TorchVecEnv`.
+        TypeError: ``env`` is not a `cfp.TorchVecEnv`, or ``config`` is None.
     """
 
     sees: ClassVar[Sees] = "state"

@@ -275,7 +275,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         _init_setup_model: Make the networks at once; stable-baselines3 passes False to load a saved model.
 
     Raises:
-        TypeError: ``env`` is not a `cfp.TorchVecEnv`.
+        TypeError: ``env`` is not a `cfp.TorchVecEnv`, or ``config`` is None.
         cfp.CheckpointError: The file of the teacher is missing, damaged, or not a policy.
         cfp.ConfigError: The teacher does not go with task, environment or options.
     """
