@@ -211,11 +211,15 @@ def draw_returns() -> None:
     save(figure, "returns.svg")
 
 
+#: What rows of trainings with the default options say of them: the default once, and today.
+DEFAULT = ("", "critics alone for 2250 steps", "critics alone for 2250 steps; another processor")
+
+
 def draw_rewards() -> None:
     """Evaluations during long trainings from rewards, in thousands of steps and of the return."""
     trainings: dict[str, dict[tuple[str, str], list[tuple[float, float]]]] = {}
     for row in read("rewards-long.csv"):
-        if row["change"] in ("", "critics alone for 2250 steps"):  # the default once, and today
+        if row["change"] in DEFAULT:
             point = int(row["step"]) / 1000, int(row["mean"]) / 1000
             trainings.setdefault(row["task"], {}).setdefault((row["seed"], row["change"]), []).append(point)
     figure = Figure(figsize=(8.6, 4.2), layout="constrained")
