@@ -1,12 +1,20 @@
-"""Writing files so that a program that is killed meanwhile leaves the old file or the new one, whole."""
+"""Files that are whole: written in one move, and read only if their checksums are right."""
 
 from __future__ import annotations
 
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
+
+import numpy as np
+from numpy.lib.npyio import NpzFile
+
+#: What `open_npz` raises for damaged files, besides ``OSError`` and ``EOFError``.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 @contextmanager
@@ -24,3 +32,19 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException:  # a simulation that fails, a second Ctrl-C
         aside.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def open_npz(path: str | os.PathLike[str]) -> Iterator[NpzFile]:
+    """The arrays of a file ``.npz``; a ``zipfile.BadZipFile`` if one is damaged. Nothing is unpickled.
+
+    NumPy compares a checksum only where it reads an array to its end, which a damaged shape may prevent.
+    """
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise zipfile.BadZipFile("it is no archive")  # NumPy would suggest to unpickle it
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as archive:
+            if (damaged := archive.zip.testzip()) is not None:
+                raise zipfile.BadZipFile(f"{damaged} is damaged")
+            yield archive

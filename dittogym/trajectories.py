@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -21,7 +19,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from dittogym.bodies.positions import MAX_SEED
 from dittogym.env import Env
-from dittogym.files import replacing
+from dittogym.files import ZIP_ERRORS, open_npz, replacing
 from dittogym.render.recording import as_function, play
 from dittogym.torch_env import TorchEnv
 from torchmpm import checks
@@ -33,8 +31,6 @@ FIELDS = ("x", "v", "C", "F", "Jp")
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 ABOUT = ("seed", "task", "environment")
 FORMAT, VERSION = "dittogym-episodes", 2
-#: What zipfile raises for damaged archives, besides ``OSError`` and ``EOFError``.
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +185,7 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
         FileNotFoundError: There is no such file.
     """
     try:
-        if not zipfile.is_zipfile(path) and os.path.exists(path):
-            raise ValueError("it is no archive")  # NumPy would suggest to unpickle it
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        with open_npz(path) as archive:
             about = json.loads(str(archive["about"]))
             if (about["format"], about["version"]) != (FORMAT, VERSION):
                 raise ValueError(f"its format is {about['format']} {about['version']}")

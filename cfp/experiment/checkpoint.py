@@ -23,7 +23,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically
 from cfp.learner import Learner
 from cfp.sac.replay import FIELDS
-from dittogym.trajectories import ZIP_ERRORS
+from dittogym.files import ZIP_ERRORS, open_npz
 
 VERSION = 4
 #: What torch raises for damaged files, besides ``pickle.UnpicklingError``.
@@ -119,7 +119,7 @@ def _write_arrays(file: BinaryIO, arrays: dict[str, np.ndarray]) -> None:
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        with open(path, "rb") as file, np.load(file) as archive:
+        with open_npz(path) as archive:
             return {name: archive[name] for name in FIELDS}
     except (OSError, ValueError, KeyError, EOFError, MemoryError, *ZIP_ERRORS) as error:
         raise CheckpointError(f"{path}: this part of the replay buffer is missing or damaged ({error})") from error
