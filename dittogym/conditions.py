@@ -37,6 +37,8 @@ _FACTORS = ("mu", "yield_stress", "gravity")
 _NAMES = ("latency", "action_noise", "action_dropout", "observation_dropout", *_FACTORS, "shift", "turn", "velocity")
 #: Degrees between the directions in which a turned robot is tried.
 TURN_STEP = 11.25
+#: Bounds of values; that of ``shift``, m, is the height of the window.
+_HIGHEST = {"action_dropout": 1.0, "observation_dropout": 1.0, "chance": 1.0, "shift": 1.0}
 #: Fields that are not ranges.
 _SINGLE = ("shift", "turn", "velocity", "chance")
 
@@ -142,11 +144,7 @@ def as_conditions(given: Any) -> Conditions | None:
 def _checked(name: str, value: Any) -> float:
     if name == "latency":
         return checks.whole(name, value, 0)
-    # The window is 1 m high.
-    highest = dict.fromkeys(("action_dropout", "observation_dropout", "chance", "shift"), 1.0).get(name, math.inf)
-    checks.number(name, value, **({"above": 0.0} if name == "mu" else {"least": 0.0}))
-    if value > highest:
-        raise ValueError(f"{name} must be at most {highest:g}, got {value}")
+    checks.number(name, value, **({"above": 0.0} if name == "mu" else {"least": 0.0}), most=_HIGHEST.get(name))
     return float(value)
 
 

@@ -22,7 +22,7 @@ from dittogym.observation import Camera
 from dittogym.physics import NAMES, Physics, bodies_of
 from dittogym.rewards import EXACT, SMOOTH, Features, Reward, RewardOps, TaskState, Transition, action_cost, features_of
 from dittogym.spec import DT, TaskSpec
-from torchmpm import ParticleState, Solver, tree
+from torchmpm import ParticleState, Solver, checks, tree
 from torchmpm.checks import Segment
 from torchmpm.stability import check_gravity, stable_dt
 from torchmpm.tree import cached_tensors
@@ -95,7 +95,17 @@ class Model:
     @functools.cached_property
     def num_robot_particles(self) -> int:
         """Number of the robot's particles, which come first."""
-        return self.solver.bodies[0].count
+        return self.counts[0]
+
+    @functools.cached_property
+    def counts(self) -> tuple[int, ...]:
+        """Number of particles of each body, robot first."""
+        return tuple(body.count for body in self.solver.bodies)
+
+    @functools.cached_property
+    def full_size(self) -> bool:
+        """Whether there are as many particles as with ``particles="full"``."""
+        return self.counts == tuple(body.count for body in self.spec.bodies)
 
     def solver_for(self, physics: Physics) -> Solver:
         """Return the solver with other constants of the matter.
@@ -105,7 +115,7 @@ class Model:
         """
         if not physics:
             return self.solver
-        bodies = bodies_of(self.spec, self.camera.counts, self.camera.particle_weight, physics)
+        bodies = bodies_of(self.spec, self.counts, physics)
         return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
 
@@ -123,14 +133,18 @@ def make_model(
         dt: Duration of a substep, s.
 
     Raises:
-        ValueError: ``backend`` is unknown or not available, there are other numbers of ``counts`` than bodies, or the
-            matter, its muscles or gravity need shorter substeps.
+        ValueError: A number is out of range, ``backend`` is unknown or not available, there are other numbers of
+            ``counts`` than bodies, or the matter, its muscles or gravity need shorter substeps.
     """
     full = tuple(body.count for body in spec.bodies)
-    weight = tuple(n / m for n, m in zip(full, counts, strict=True))
+    if len(counts) != len(full):
+        raise ValueError(f"counts must be {len(full)} numbers, one for each body, got {counts!r}")
+    counts = tuple(checks.whole(f"counts[{i}]", n, 1) for i, n in enumerate(counts))
+    substeps, segment = checks.whole("substeps", substeps, 1), checks.segment(segment)
+    checks.number("dt", dt, above=0.0)
     solver = Solver(
         GRID,
-        bodies_of(spec, counts, weight, {}),
+        bodies_of(spec, counts, {}),
         gravity=spec.gravity,
         damping=spec.damping ** (dt / DT),
         rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules),
@@ -139,8 +153,16 @@ def make_model(
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
     native = backend in ("auto", "native")  # of the camera, which draws any matter
-    hidden = tuple(body.hidden_velocity for body in spec.bodies)
-    camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, counts == full, native)
+    camera = Camera(
+        spec.view,
+        spec.window,
+        spec.observed_boxes,
+        counts=counts,
+        particle_weight=tuple(n / m for n, m in zip(full, counts, strict=True)),
+        hidden_velocity=tuple(body.hidden_velocity for body in spec.bodies),
+        pixels=counts == full,
+        native=native,
+    )
     model = Model(spec, solver, substeps, camera, segment)
     check_stability(model, {})
     return model
@@ -453,12 +475,15 @@ def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 
 
 @torch.no_grad()
-def check_rewards(model: Model, positions: Tensor) -> None:
+def check_rewards(model: Model, positions: Tensor) -> set[str]:
     """Call a task's functions once, right after a reset, and refuse what they must not return.
 
     Args:
         model: The task.
         positions: (B, N, 2), m. With two simulations, numbers for one alone are found as well.
+
+    Returns:
+        The names of the task's state.
 
     Raises:
         TypeError: ``reward_fn`` returns no :class:`dittogym.rewards.Reward`, or something without names.
@@ -499,6 +524,7 @@ def check_rewards(model: Model, positions: Tensor) -> None:
         before, after = ({n: _kind(v) for n, v in each.items()} for each in (state.task_state, reward.task_state))
         if before != after:
             raise ValueError(f"{who} must return task_state like initial_task_state, {before}, got {after}")
+    return set(state.task_state)
 
 
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:

@@ -19,7 +19,7 @@ from dittogym.render.recording import Act, Recording, as_function, film
 from dittogym.render.scene import check_size, describe
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
-from dittogym.tasks import make_spec
+from dittogym.tasks import usual_horizon
 from dittogym.torch_env import TorchEnv
 from torchmpm import ParticleState, checks
 
@@ -175,7 +175,7 @@ class Env(Shell, gymnasium.Env[np.ndarray, np.ndarray]):
             batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")
         self.torch_env = TorchEnv(task, 1, **options)
-        self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
+        self._own_limit = self.torch_env.spec.horizon != usual_horizon(task)
         self.observation_space, self.action_space = spaces(self.torch_env)
         self._screen, self._return = None, 0.0
         if render_mode == "human":

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 
 #: What `open_npz` raises for damaged files, besides ``OSError`` and ``EOFError``.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
@@ -35,7 +35,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def open_npz(path: str | os.PathLike[str]) -> Iterator[NpzFile]:
+def open_npz(path: str | os.PathLike[str]) -> Iterator[Mapping[str, Any]]:
     """The arrays of a file ``.npz``; a ``zipfile.BadZipFile`` if one is damaged. Nothing is unpickled.
 
     NumPy compares a checksum only where it reads an array to its end, which a damaged shape may prevent.

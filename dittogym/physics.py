@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from dittogym.copies import constant
 from dittogym.spec import TaskSpec
-from torchmpm import Body, Elastic, Material, VonMises, checks, tree
+from torchmpm import Body, Elastic, VonMises, checks, tree
 
 #: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -128,25 +127,24 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
     return {name: tree.where(mask, *pair) for name, pair in pairs.items()}
 
 
-def bodies_of(
-    spec: TaskSpec, counts: tuple[int, ...], particle_weight: tuple[float, ...], physics: Physics
-) -> tuple[Body, ...]:
+def bodies_of(spec: TaskSpec, counts: tuple[int, ...], physics: Physics) -> tuple[Body, ...]:
     """Robot and objects as the solver has them, with ``physics`` in place of the task's own constants.
 
     The full-size particles that a particle of each body stands for are a factor on its mass and volume, so that density
     and stiffness mean the same for every particle count.
     """
     values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
+    # Those of a reset were checked there; to check them in every step would wait for a GPU.
+    make: Callable[..., Any] = tree.unchecked if physics else lambda kind, *values: kind(*values)
     bodies: list[Body] = []
-    for body, count, weight in zip(spec.bodies, counts, particle_weight, strict=True):
+    for body, count in zip(spec.bodies, counts, strict=True):
+        weight = body.count / count
         first, robot = sum(earlier.count for earlier in bodies), not bodies
         own = {name: _part_of(value, slice(first, first + count)) for name, value in values.items()}
         kind, constants = (VonMises, ("mu", "lam", "yield_stress")) if robot else (Elastic, ("mu", "lam"))
-        # Those of a reset were checked there; to check them in every step would wait for a GPU.
-        make: Callable[..., Material] = functools.partial(tree.unchecked, kind) if physics else kind
-        default = make(*(own[name] for name in constants))
+        default = make(kind, *(own[name] for name in constants))
         material = default if body.material is None else body.material
-        bodies.append(Body(count, material, weight * body.mass * own["mass"], weight, muscle=robot))
+        bodies.append(make(Body, count, material, weight * body.mass * own["mass"], weight, robot))
     return tuple(bodies)
 
 

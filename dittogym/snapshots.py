@@ -57,10 +57,10 @@ def constants_of(model: Model, like: Tensor) -> dict[str, str]:
         model: The task.
         like: Gives dtype and device.
     """
-    spec, camera = model.spec, model.camera
+    spec = model.spec
     values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.name not in ("coarse", "fine")}
-    own = {"substeps": model.substeps, "dt": model.solver.dt, "dtype": like.dtype, "device": like.device}
-    own |= {"particles": camera.counts, "particle weights": camera.particle_weight}
+    own = {"particles": model.counts, "substeps": model.substeps, "dt": model.solver.dt}
+    own |= {"dtype": like.dtype, "device": like.device}
     return {name: _as_text(value) for name, value in ({"task": values.pop("name")} | own | values).items()}
 
 

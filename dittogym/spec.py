@@ -12,7 +12,7 @@ from dittogym.bodies.shapes import Shape
 from dittogym.geometry import NODES, Box, Centre, Obstacle, Window
 from dittogym.observation import SIZE, goal_box
 from dittogym.rewards import Reward, TaskState, Transition
-from torchmpm import Material, checks
+from torchmpm import Body, Material, checks
 
 #: Duration of a control step, s.
 CONTROL_STEP = 1e-2
@@ -37,7 +37,8 @@ class BodySpec:
 
     Raises:
         ValueError: A number is out of range, or ``hidden_velocity`` is not True or False.
-        TypeError: ``shape`` is not a :class:`dittogym.bodies.shapes.Shape`.
+        TypeError: ``shape`` is not a :class:`dittogym.bodies.shapes.Shape`, or ``material`` not a
+            :class:`torchmpm.Material`.
     """
 
     shape: Shape
@@ -53,6 +54,8 @@ class BodySpec:
         checks.number("mass", self.mass, above=0.0)
         if self.lite is not None:
             object.__setattr__(self, "lite", checks.whole("lite", self.lite, 1))
+        if self.material is not None:
+            Body(1, self.material)  # checks it
         checks.flag("hidden_velocity", self.hidden_velocity)
 
 
@@ -160,8 +163,9 @@ class TaskSpec:
             checks.number(f"weights[{name!r}]", value, least=0.0 if name in ("split", "action") else None)
         checks.number("mu", self.mu, above=0.0)
         checks.number("lam", self.lam)
-        for name in ("yield_stress", "max_actuation", "damping"):
+        for name in ("yield_stress", "max_actuation"):
             checks.number(name, getattr(self, name), least=0.0)
+        checks.number("damping", self.damping, least=0.0, most=1.0)
         if self.split_limit is not None:
             checks.number("split_limit", self.split_limit, above=0.0)
         object.__setattr__(self, "patch", checks.whole("patch", self.patch, 4, NODES))

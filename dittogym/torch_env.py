@@ -127,7 +127,6 @@ class TorchEnv:
     ) -> None:
         self.spec = make_spec(task, **task_options)
         self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
-        checks.segment(segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
         if (name := str(dtype).removeprefix("torch.")) not in DTYPES:
@@ -142,11 +141,11 @@ class TorchEnv:
         self.action_layout: ActionLayout = action_layout or "image"
         counts = particle_counts(self.spec, particles)
         self.model = make_model(self.spec, counts, substeps, backend, segment, float(dt))
-        random = self.model.camera.pixels  # with full counts, both as in the reference
+        random = self.model.full_size  # with full counts, both as in the reference
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         trial = InitialPositions(self.spec, counts, 2, random=False, resample=False)
-        core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
+        self._task_state = core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
         self.device = self._like.device  # "cuda" with the number of the current device
         self._physics: Physics = {}
         self.conditions = as_conditions(conditions)
@@ -156,11 +155,13 @@ class TorchEnv:
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
         self._actuation: Tensor | None = None
-        # On a GPU, 0 as long as all actions since the last reset were finite, else NaN.
-        self._unread = None if self.device.type == "cpu" else torch.zeros((), dtype=self.dtype, device=self.device)
+        # On a GPU: NaN if an action since the last reset was not finite, else 0.
+        self._nonfinite_action = (
+            None if self.device.type == "cpu" else torch.zeros((), dtype=self.dtype, device=self.device)
+        )
         # What a user wrote, such as materials and reward functions, is called in every step.
-        own = self.device.type == "cuda" and self.model.solver.kernels.unsupported(self.device) is None
-        self._replayed = Replayed(core.simulate) if own and backend != "eager" else None
+        recordable = self.device.type == "cuda" and self.model.solver.kernels.unsupported(self.device) is None
+        self._replayed = Replayed(core.simulate) if recordable and backend != "eager" else None
 
     def __repr__(self) -> str:
         return f"TorchEnv({self.spec.name!r}, {self.num_envs}, {self.action_resolution}, device={str(self.device)!r})"
@@ -195,7 +196,7 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        if self._env_state is not None and (missing := self._env_state.task_state.keys() - value.task_state.keys()):
+        if missing := self._task_state - value.task_state.keys():
             raise ValueError(f"env_state must have the task state of this task, got none of {sorted(missing)}")
         self._env_state, self._actuation, self._observation = self._with_own_conditions("env_state", value), None, None
 
@@ -341,11 +342,11 @@ class TorchEnv:
             where = to_device(mask, self.device)
             physics = values if whole else merged(self.spec, physics, values, where, self._like)
             self._check_stability(physics)
-        drawn = self._initial_positions.draw(seed, mask, options.get("positions"), self._like)
+        starts = self._initial_positions.draw(seed, mask, options.get("positions"), self._like)
         index = to_device(np.flatnonzero(mask), self.device)
         conditions, all_physics = self._draw_conditions(seed, physics)
-        chosen = tree.map(Tensor.clone if whole else lambda t: t[index], (drawn.positions, all_physics, conditions))
-        fresh, observation = self._begin(*chosen)
+        chosen = tree.map(Tensor.clone if whole else lambda t: t[index], (starts.positions, all_physics, conditions))
+        fresh, observation = self._begin(*chosen, np.flatnonzero(mask) if starts.given else None)
         info = core.info_of(self.model, fresh, fresh.start)
         actuation = None
         if not whole:
@@ -357,8 +358,8 @@ class TorchEnv:
             fresh = replace(fresh, physics=merged(self.spec, old.physics, all_physics, where, self._like))
             actuation = self._actuation_without(where)
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
-        if drawn is not self._initial_positions:
-            self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
+        if starts is not self._initial_positions:
+            self._initial_positions = replace(starts, positions=starts.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
         self._env_state, self._actuation, self._observation = fresh, actuation, observation
         return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
@@ -385,13 +386,17 @@ class TorchEnv:
             changed = {name: getattr(self.conditions, name) for name in self.conditions.changes(self.spec)}
             raise ValueError(f"conditions must leave the matter stable, got {changed}, with which {error}") from error
 
-    def _begin(self, positions: Tensor, physics: Physics, conditions: Drawn) -> tuple[EnvState, Tensor]:
-        """State and observation of new episodes."""
+    def _begin(
+        self, positions: Tensor, physics: Physics, conditions: Drawn, elements: np.ndarray | None
+    ) -> tuple[EnvState, Tensor]:
+        """State and observation of new episodes; positions of ``elements`` that a user gave may be moved too far."""
         if self.conditions is None:
             return core.reset(self.model, positions, physics)
         velocity = None
         if self.conditions.moves_start:
             positions = varied.start(conditions, positions, self.model.num_robot_particles)
+            if elements is not None:
+                self._initial_positions.check_inside(positions, elements)
             velocity = conditions["velocity"]
         state, image = core.reset(self.model, positions, physics, velocity)
         state = replace(state, conditions=conditions)
@@ -463,8 +468,8 @@ class TorchEnv:
                 hint = "the option resolution of the environment sets its last two numbers"
             raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}; {hint}")
         action = action.to(self.device, self.dtype)
-        if self._unread is not None:
-            self._unread = self._unread + (action.detach() * 0.0).sum()
+        if self._nonfinite_action is not None:
+            self._nonfinite_action = self._nonfinite_action + (action.detach() * 0.0).sum()
         # A sum that is finite spares the test of every entry; one of finite entries may overflow.
         elif not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):
             raise ValueError(f"action must be finite, got {wrong} entries that are NaN or infinite")
@@ -472,8 +477,8 @@ class TorchEnv:
 
     def _refuse_earlier_actions(self) -> None:
         """Raise the error that steps on a GPU would have had to wait for."""
-        if self._unread is not None and math.isnan(float(self._unread)):
-            self._unread = torch.zeros_like(self._unread)
+        if self._nonfinite_action is not None and math.isnan(float(self._nonfinite_action)):
+            self._nonfinite_action = torch.zeros_like(self._nonfinite_action)
             raise ValueError("action must be finite, got NaN or infinite entries in a step since the last reset")
 
     def soft_observation(self) -> Tensor:

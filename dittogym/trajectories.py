@@ -127,7 +127,7 @@ def _options(env: TorchEnv) -> dict[str, Any]:
     """`Episode.environment`."""
     conditions = None if env.conditions is None else asdict(env.conditions)
     return {
-        "particles": list(env.model.camera.counts),
+        "particles": list(env.model.counts),
         "substeps": env.model.substeps,
         "dt": env.model.solver.dt,
         "dtype": str(env.dtype).removeprefix("torch."),

@@ -17,7 +17,7 @@ from dittogym.copies import to_device
 from dittogym.env import RENDER_FPS, Shell, as_numpy, as_tensor, spaces, step_to_host
 from dittogym.snapshots import Snapshot
 from dittogym.spec import TaskSpec
-from dittogym.tasks import make_spec
+from dittogym.tasks import usual_horizon
 from dittogym.torch_env import TorchEnv, find_mask
 from torchmpm import checks
 
@@ -114,7 +114,7 @@ class BatchEnv(Shell, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
         self.num_envs = num_envs
-        own, usual = self.torch_env.spec.horizon, make_spec(task).horizon
+        own, usual = self.torch_env.spec.horizon, usual_horizon(task)
         # Gymnasium passes the limit of the id, whatever the task's options say.
         limit = own if max_episode_steps in (None, usual) else max_episode_steps
         self._horizon = math.inf if limit == -1 else limit

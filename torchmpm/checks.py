@@ -27,8 +27,10 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     return number
 
 
-def number(name: str, value: Any, *, least: float | None = None, above: float | None = None) -> None:
-    """Raise a ValueError unless this is a finite number, at least ``least`` and above ``above``."""
+def number(
+    name: str, value: Any, *, least: float | None = None, above: float | None = None, most: float | None = None
+) -> None:
+    """Raise a ValueError unless this is a finite number, at least ``least``, above ``above`` and at most ``most``."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{name} must be a number, got {value!r}")
     if not math.isfinite(value):
@@ -37,6 +39,8 @@ def number(name: str, value: Any, *, least: float | None = None, above: float | 
         raise ValueError(f"{name} must {_at_least(least)}, got {value}")
     if above is not None and not float(value) > above:
         raise ValueError(f"{name} must be {'positive' if above == 0 else f'above {above}'}, got {value}")
+    if most is not None and not float(value) <= most:
+        raise ValueError(f"{name} must be at most {most:g}, got {value}")
 
 
 def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:

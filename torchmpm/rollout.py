@@ -63,8 +63,13 @@ def repeated(
     arguments = () if shared is None else (shared,)
     checkpointed = _checkpointed
     if shared is not None and segment < times:
-        tree.check_open("shared", shared)
-        tree.check_open("state", state)
+        for name, given in (("shared", shared), ("state", state)):
+            if (opaque := tree.opaque_leaf(given)) is not None:  # derivatives in tensors that it hides would be lost
+                raise TypeError(
+                    f"{name} must hold only tensors, numbers, strings and containers of them, got a "
+                    f"{type(opaque).__name__}: register a dataclass with torchmpm.tree.register, and give the tensors "
+                    "of other objects"
+                )
         tensors = tree.leaves((shared, state))
         if not tree.has_tangents(tensors) and not _autocast(tensors):
             checkpointed = _replayed

@@ -107,9 +107,7 @@ class Solver:
         else:
             checks.pair("gravity", self.gravity)
             object.__setattr__(self, "gravity", tuple(map(float, self.gravity)))
-        checks.number("damping", self.damping, least=0.0)
-        if self.damping > 1:
-            raise ValueError(f"damping must be at most 1, got {self.damping}")
+        checks.number("damping", self.damping, least=0.0, most=1.0)
         checks.flag("allow_unstable", self.allow_unstable)
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
@@ -118,7 +116,7 @@ class Solver:
             raise ValueError(f"backend 'native' {NO_COMPILER}")
         for name, tensor in self.constants.items():
             if tensor.is_floating_point() and tensor.numel():  # a material may have tensors of all kinds
-                checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
+                checks.entries(name, tensor)
         if not self.allow_unstable:
             self._check_stability()
             stability.check_gravity("gravity", self.gravity, self.grid.h, self.dt)
@@ -301,7 +299,11 @@ class Solver:
     @property
     def _reads_scene_alone(self) -> bool:
         """Whether a substep reads no tensors but those of the scene; custom parts of it may read others."""
-        return not self._overridden and not torch.compiler.is_compiling() and tree.is_open((self.grid, self.bodies))
+        return (
+            not self._overridden
+            and not torch.compiler.is_compiling()
+            and tree.opaque_leaf((self.grid, self.bodies)) is None
+        )
 
     def _not_native(self, state: ParticleState, *fields: Tensor | None) -> str | None:
         """Why the kernels cannot run a step, or ``None`` if they can."""

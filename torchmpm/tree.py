@@ -104,28 +104,8 @@ def leaves(tree: Any) -> list[Tensor]:
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
-def is_open(tree: Any) -> bool:
-    """Whether all leaves of a tree are tensors, numbers, strings or None, so that none hides tensors of its own."""
-    return _closed(tree) is None
-
-
-def check_open(name: str, tree: Any) -> None:
-    """Raise a TypeError unless :func:`is_open`: derivatives in tensors that a leaf hides would be lost.
-
-    Args:
-        name: What the tree is, for the message.
-        tree: The tree.
-    """
-    closed = _closed(tree)
-    if closed is not None:
-        raise TypeError(
-            f"{name} must hold only tensors, numbers, strings and containers of them, got a {type(closed).__name__}: "
-            "register a dataclass with torchmpm.tree.register, and give the tensors of other objects"
-        )
-
-
-def _closed(tree: Any) -> Any:
-    """The first leaf that could hide tensors, or ``None``."""
+def opaque_leaf(tree: Any) -> Any:
+    """The first leaf of a tree that is no tensor, number, string or None, and so could hide tensors; else ``None``."""
     leaves = pytree.tree_leaves(tree)
     return next((leaf for leaf in leaves if not isinstance(leaf, Tensor | int | float | str | None)), None)
 

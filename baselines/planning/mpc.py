@@ -111,7 +111,7 @@ class Surrogate:
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
         self.env = small
         self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
-        same = large.model.camera.counts == small.model.camera.counts
+        same = large.model.counts == small.model.counts
         own = {} if same else small.env_state.task_state
         # Numbers of particles, such as those of the tip in GROW, see `dittogym.Reward`.
         self._particle_state = {

@@ -41,14 +41,13 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
         count = spec.robot.lite or min(LITE, full[0])
         counts = (count, *(b.lite or max(1, round(count * b.count / full[0])) for b in spec.objects))
     elif isinstance(particles, (int, np.integer)) and not isinstance(particles, bool):
-        counts = (int(particles), *(max(1, round(particles * n / full[0])) for n in full[1:]))
+        count = checks.whole("particles", particles, 1)
+        counts = (count, *(max(1, round(count * n / full[0])) for n in full[1:]))
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
         allowed = f"'full', 'lite', a number of robot particles, or a tuple of {len(full)}, one for each body"
         raise ValueError(f"particles must be {allowed}, got {particles!r}")
-    if min(counts) < 1:
-        raise ValueError(f"particles must be at least 1 for every body, got {particles!r}")
     return counts
 
 
@@ -93,6 +92,7 @@ class InitialPositions:
         resample: Draw anew at every reset.
         generators: By element of the batch.
         positions: (B, N, 2) in the world, m; empty before the first draw.
+        given: Whether a user gave some of them, so that conditions may move them out of the window.
     """
 
     spec: TaskSpec
@@ -102,6 +102,7 @@ class InitialPositions:
     resample: bool
     generators: Mapping[int, np.random.RandomState] = field(default_factory=dict)
     positions: Tensor = field(default_factory=lambda: torch.empty(0))
+    given: bool = False
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
@@ -120,7 +121,7 @@ class InitialPositions:
         chosen = np.flatnonzero(redrawn)
         if given is not None:
             positions = self._given(given, like)
-            self._check_inside(positions, chosen)
+            self.check_inside(positions[torch.from_numpy(chosen)], chosen)
         elif len(chosen):
             stacked = np.zeros((self.num_envs, sum(self.counts), 2))
             bodies = tuple(zip(self.spec.bodies, self.counts, strict=True))
@@ -128,13 +129,14 @@ class InitialPositions:
                 drawn = [body_positions(body, n, generators[i], random=self.random) for body, n in bodies]
                 stacked[i] = np.concatenate(drawn)
             host = torch.from_numpy(stacked).to(like.dtype)
-            self._check_inside(host, chosen)  # before it goes to a GPU, which would have to be waited for
+            self.check_inside(host[chosen], chosen)  # before it goes to a GPU, which would have to be waited for
             positions = to_device(host.numpy(), like.device)
         else:
             return self
         if len(self.positions):
             positions = tree.where(to_device(redrawn, like.device), positions, self.positions)
-        return replace(self, generators=generators, positions=positions)
+        some = given is not None or (self.given and not redrawn.all())
+        return replace(self, generators=generators, positions=positions, given=some)
 
     def seeds(self, seed: Seed) -> Sequence[int | None]:
         """The seed of every element."""
@@ -156,8 +158,8 @@ class InitialPositions:
             raise ValueError(f"positions must have shape {allowed}, got {tuple(positions.shape)}")
         return positions.expand(self.num_envs, *shape).contiguous()
 
-    def _check_inside(self, positions: Tensor, elements: np.ndarray) -> None:
-        positions = positions if len(elements) == self.num_envs else positions[torch.from_numpy(elements)]
+    def check_inside(self, positions: Tensor, elements: np.ndarray) -> None:
+        """Refuse positions (n, N, 2), m, of some elements (n,) that are not finite or outside the window."""
         if not bool((finite := torch.isfinite(positions)).all()):
             raise ValueError(f"positions must be finite, got {positions[~finite][0].item()}")
         origin = self.spec.window.origin(positions[:, : self.counts[0]].mean(1))

@@ -170,7 +170,7 @@ def describe(model: Model) -> Scene:
     """The scene of a task."""
     spec = model.spec
     matter = []
-    for count, body in zip(model.camera.counts, spec.bodies, strict=True):
+    for count, body in zip(model.counts, spec.bodies, strict=True):
         grains = isinstance(body.material, Snow)
         radius = GRAIN_RADIUS if grains else RADIUS
         colour = ROBOT if body is spec.robot else GROUND_BODY if grains else OBJECT

@@ -83,6 +83,11 @@ def _registration_fault(task: str, module: str, name: str) -> str:
     return ""
 
 
+def usual_horizon(task: str | TaskSpec) -> int:
+    """Horizon of a task without its options, which is the limit that Gymnasium has for its ids."""
+    return make_spec(task.name if isinstance(task, TaskSpec) and task.name in TASKS else task).horizon
+
+
 def make_spec(
     task: str | TaskSpec, *, body: BodyLike | None = None, obstacles: Sequence[Obstacle] | None = None, **options: Any
 ) -> TaskSpec:

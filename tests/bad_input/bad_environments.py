@@ -73,6 +73,12 @@ def load(mask=None, **changes):
     return begun().load(other.save(), mask)
 
 
+def moved_out():
+    """Given positions inside of the window, which a shift moves out of it."""
+    at_edge = np.linspace((0.8, 0.5), (0.999, 0.5), 60)
+    env(task="shapematch", num_envs=8, conditions={"shift": 0.1}).reset(seed=0, options={"positions": at_edge})
+
+
 def state(**changes):
     """The state of an environment that differs."""
     begun(task="catch", particles=(60, 60)).env_state = begun(**changes).env_state
@@ -86,6 +92,12 @@ def pure(action):
 
 def pure_reset(positions, **physics):
     return core.reset(env().model, positions, physics)
+
+
+def model(**changes):
+    """A model of the pure functions."""
+    arguments = {"spec": make_spec("run"), "counts": (60,), "substeps": 1, "backend": "eager", **changes}
+    return core.make_model(**arguments)
 
 
 def film(path=None, policy=lambda seen: None, **options):
@@ -212,6 +224,7 @@ VALUES = [
     ("positions", lambda: reset(positions=np.zeros((59, 2)))),
     ("positions", lambda: reset(positions=np.full((60, 2), NAN))),
     ("positions", lambda: reset(positions=np.linspace((0.0, 0.5), (2.0, 0.5), 60))),  # outside the window
+    ("positions", moved_out),
     ("physics", lambda: reset(physics=3.0)),
     ("'nu'", lambda: physics(nu=0.3)),
     *(
@@ -234,6 +247,7 @@ VALUES = [
     ("obstacles", lambda: load(obstacles=())),
     ("robot", lambda: load([True, False], body=np.ones((9, 5), bool))),
     *(("env_state", lambda c=c: state(**c)) for c in ({"particles": 120}, {"particles": 9}, {"dtype": "float64"})),
+    ("task state", lambda: setattr(env(task="grow", num_envs=2), "env_state", begun().env_state)),  # of another task
     # Steps, pictures and films.
     ("action", lambda: begun().step(np.zeros((2, 2, 8, 8)))),
     ("action", lambda: action(dtype=torch.int64)),
@@ -250,6 +264,11 @@ VALUES = [
     ("action", lambda: pure(torch.zeros(2, 2, 8, 8, dtype=torch.float64))),
     ("positions", lambda: pure_reset(torch.zeros(60, 2))),
     ("physics", lambda: pure_reset(torch.full((1, 60, 2), 0.3), young=torch.ones(1))),
+    ("counts", lambda: model(counts=(60, 60))),
+    ("counts[0]", lambda: model(counts=(0,))),
+    *(("substeps", lambda s=s: model(substeps=s)) for s in (0, -1, 2.5)),
+    ("segment", lambda: model(segment=0)),
+    *(("dt", lambda dt=dt: model(dt=dt)) for dt in ("x", -1e-4)),
     ("zoom", lambda: begun().render(zoom=1e-9)),
     ("size", lambda: begun().render(size=3)),
     ("muscles", lambda: begun().render(muscles="no")),
@@ -315,6 +334,7 @@ VALUES = [
     ("patch", lambda: spec(patch=200)),
     ("objects", lambda: spec(objects=(spec().robot,) * 2)),
     ("max_actuation", lambda: spec(max_actuation=-5.0)),
+    ("damping", lambda: spec(damping=2.0)),
     ("patch_centre y", lambda: spec(patch_centre=(None, "up"))),
     ("view", lambda: spec(view=(-0.1, 0.5))),
     ("coarse", lambda: spec(coarse=17)),
@@ -345,6 +365,7 @@ TYPES = [
     ("path", lambda: film(size=64)),
     ("num_envs", lambda: single(num_envs=3)),
     ("env_state", lambda: setattr(begun(), "env_state", None)),
+    ("material", lambda: BodySpec(Disc((0.4, 0.2), 0.1), 9, material=3)),
     ("env", lambda: action_resolution(env(), 4)),
     ("env", lambda: trajectories.record(None, lambda seen: None)),
     *(("fields", lambda f=f: trajectories.record(env(), lambda seen: None, fields=f)) for f in ("xv", (1,))),

@@ -87,7 +87,7 @@ TRAIN = [
         ("--learner ppo", "--learner", "'ppo'"),
         ("--seed -1", "seed must be between 0 and 2147483647, got -1"),
         ("--alpha nan", "alpha must be finite"),
-        ("--particles 0", "particles must be at least 1 for every body, got 0"),
+        ("--particles 0", "particles must be at least 1, got 0"),
         ("--resolutions 5", "resolutions must be increasing values of (4, 8,"),
         ("--backend warp", "backend must be one of", "'warp'"),
         ("--target none.png", "target must be 'star'", "'none.png'"),

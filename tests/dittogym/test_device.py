@@ -24,7 +24,7 @@ MASK = {"torch.cpu": 1, "torch.numpy": 1}
 
 def on_a_gpu(env: TorchEnv) -> TorchEnv:
     """The environment with the check of actions that it has on a GPU, after steps that leave its constants there."""
-    env._unread = torch.zeros((), dtype=env.dtype)
+    env._nonfinite_action = torch.zeros((), dtype=env.dtype)
     return env
 
 

@@ -115,6 +115,15 @@ def test_a_longer_limit_than_the_horizon() -> None:
         assert limits == [False] * (limit - 1) + [True]
 
 
+def test_the_horizon_of_a_specification_under_the_id_of_its_task() -> None:
+    spec = dataclasses.replace(dittogym.make_spec("run"), horizon=3)
+    single = gymnasium.make("dittogym/run-coarse-v0", task=spec, **SMALL)
+    batch = gymnasium.make_vec("dittogym/run-coarse-v0", 1, vectorization_mode="vector_entry_point", task=spec, **SMALL)
+    for each in (single, batch):
+        each.reset(seed=0)
+        assert [bool(each.step(np.zeros(each.action_space.shape, np.float32))[3]) for _ in range(3)] == [0, 0, 1]
+
+
 def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypatch) -> None:
     """By ``MODULE:NAME``, and by a process that gets nothing but the specification of the environment as JSON."""
     monkeypatch.syspath_prepend(tmp_path)

@@ -98,12 +98,11 @@ VALUES = {
     ],
     "mass": [
         *(lambda m=m: body(mass=m) for m in ([1.0], torch.ones(0), 0.0)),
+        *(lambda m=m: body(mass=torch.tensor(m)) for m in (0.0, -1.0, -1)),
         lambda: robot(5, bodies=(body(mass=torch.ones(3)),)).step(lively(5, 2)),
     ],
-    "volume": [lambda: body(volume=-1.0)],
+    "volume": [*(lambda v=v: body(volume=v) for v in (-1.0, *map(torch.tensor, (0.0, -1.0, INF))))],
     "muscle": [lambda: body(muscle="yes")],
-    "bodies[0].mass": [lambda m=m: solver(bodies=(body(mass=torch.tensor(m)),)) for m in (0.0, -1.0)],
-    "bodies[0].volume": [lambda v=v: solver(bodies=(body(volume=torch.tensor(v)),)) for v in (0.0, -1.0, INF)],
     "values of bodies[1]": [
         lambda: solver(bodies=(body(), body(material=Elastic(torch.ones(2), 1.0), mass=torch.ones(3))))
     ],

@@ -30,8 +30,7 @@ class Body:
         muscle: Whether the actuation of :meth:`torchmpm.Solver.step` acts on the particles.
 
     Raises:
-        ValueError: ``count`` is below 1, ``mass`` or ``volume`` is not positive (for a tensor: when a solver is made),
-            or ``muscle`` is not True or False.
+        ValueError: ``count`` is below 1, ``mass`` or ``volume`` is not positive, or ``muscle`` is not True or False.
         TypeError: ``material`` is not a :class:`torchmpm.Material`, or a tensor is not dense.
 
     Examples:
@@ -56,7 +55,7 @@ class Body:
             found = f"{self.material!r:.60}, which has no method {', '.join(lacking)}"
             raise TypeError(f"material must be a Material, got {found}")
         for name in ("mass", "volume"):
-            checks.value(name, getattr(self, name), above=0.0)
+            checks.entries(name, getattr(self, name), above=0.0)
         checks.flag("muscle", self.muscle)
 
     def constants(self) -> dict[str, Value]:
