@@ -26,6 +26,7 @@ from cfp.experiment.folder import Folder, holds_run, parse_folder, read_config, 
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.files import read_json
 from cfp.messages import say
+from dittogym.registration import address
 
 EXAMPLES = (
     "--task run",
@@ -95,6 +96,8 @@ def from_python(options: Mapping[str, Any], out: Path | None, resume: bool) -> C
         ConfigError: There is no such option, or a value is wrong.
     """
     values = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in options.items()}
+    if isinstance(task := values.get("task"), str):
+        values["task"] = address(task)  # so that programs that have not registered it can open the run
     defaults, out = _defaults(values, out, resume)
     return _complete(Command(defaults, out=out, resume=resume))
 

@@ -27,7 +27,7 @@ from torchmpm import checks
 #: What the conditions of B episodes are, and what they remember: tensors by name, with a leading B.
 Drawn: TypeAlias = Mapping[str, Tensor]
 #: Bounds of a uniform distribution; a single number stands for both.
-Range: TypeAlias = "float | tuple[float, float]"
+Interval: TypeAlias = "float | tuple[float, float]"
 
 #: Streams of random numbers.
 _CHANCE, _VALUE, _NOISE, _ACTION, _PIXEL, _NEXT = range(6)
@@ -69,17 +69,17 @@ class Conditions:
 
     latency: int | tuple[int, int] = 0
     """Control steps by which actions come late, whole numbers from 0; the first actions of an episode are 0."""
-    action_noise: Range = 0.0
+    action_noise: Interval = 0.0
     """Standard deviation of normal noise on each entry of an action, new in every step; 1 is full actuation."""
-    action_dropout: Range = 0.0
+    action_dropout: Interval = 0.0
     """Share of the entries of an action that are set to 0, from 0 to 1; they are chosen anew in every step."""
-    observation_dropout: Range = 0.0
+    observation_dropout: Interval = 0.0
     """Share of the 3 x 64 x 64 entries of an observation that are set to 0, from 0 to 1; chosen anew in every step."""
-    mu: Range = 1.0
+    mu: Interval = 1.0
     """Factor on the second Lame parameter of the robot, and of an object without a material of its own; positive."""
-    yield_stress: Range = 1.0
+    yield_stress: Interval = 1.0
     """Factor on the yield stress of the robot, not negative."""
-    gravity: Range = 1.0
+    gravity: Interval = 1.0
     """Factor on gravity, not negative."""
     shift: float = 0.0
     """Largest distance, m, by which the robot's start is moved in x and in y, but not downwards; at most 1."""

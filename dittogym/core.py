@@ -29,6 +29,8 @@ from torchmpm.tree import cached_tensors
 
 #: Reward of a step after which a simulation cannot go on, see :func:`is_valid`; its episode ends.
 FAILURE_REWARD = -16.0
+#: Distance from the window, m, that particles reach only in a simulation that has blown up.
+FAR = 100.0
 #: Terms that the environment adds to those of a task.
 RESERVED_TERMS = frozenset({"split", "action", "alive", "failure"})
 #: What the environment puts into ``info``, and what Gymnasium does.
@@ -431,6 +433,8 @@ def info_of(model: Model, state: EnvState, now: Features) -> dict[str, Tensor]:
 def is_valid(model: Model, state: EnvState) -> Tensor:
     """Return which simulations can go on: all their numbers are finite, and some of the robot is in the window.
 
+    Beyond :data:`FAR` from the window a position counts as not finite: the simulation has blown up.
+
     Args:
         model: The task.
         state: The state.
@@ -438,8 +442,9 @@ def is_valid(model: Model, state: EnvState) -> Tensor:
     Returns:
         (B,) bool.
     """
-    robot = state.particles.x[:, : model.num_robot_particles].detach()
-    return state.particles.is_finite() & contains(robot, state.origin.detach()).any(1)
+    x, origin = state.particles.x.detach(), state.origin.detach()
+    near = ((x - origin[:, None]).abs() < FAR).flatten(1).all(1)
+    return near & state.particles.is_finite() & contains(x[:, : model.num_robot_particles], origin).any(1)
 
 
 def _transition(model: Model, state: EnvState, now: Features, observation: Tensor, ops: RewardOps) -> Transition:
@@ -480,7 +485,7 @@ def check_rewards(model: Model, positions: Tensor) -> set[str]:
 
     Args:
         model: The task.
-        positions: (B, N, 2), m. With two simulations, numbers for one alone are found as well.
+        positions: (B, N, 2), m. With three simulations, numbers for one alone, and those of x and y, are found as well.
 
     Returns:
         The names of the task's state.

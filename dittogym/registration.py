@@ -59,6 +59,7 @@ def register(task: str, make: Callable[..., TaskSpec]) -> None:
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
     if spec.name != task:
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
+    TASKS[task] = make
     for resolution in ("coarse", "fine"):
         name = f"dittogym/{task}-{resolution}-v0"
         gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that are replaced
@@ -67,14 +68,13 @@ def register(task: str, make: Callable[..., TaskSpec]) -> None:
             entry_point="dittogym.env:Env",
             vector_entry_point="dittogym.vector:BatchEnv",
             max_episode_steps=spec.horizon,
-            kwargs={"task": _address(task, make), "resolution": resolution},
+            kwargs={"task": address(task), "resolution": resolution},
         )
-    TASKS[task] = make
 
 
-def _address(task: str, make: Callable[..., TaskSpec]) -> str:
-    """``MODULE:NAME`` where another process finds the task by importing a module, else the name alone."""
-    module = sys.modules.get(getattr(make, "__module__", ""))
+def address(task: str) -> str:
+    """``MODULE:NAME`` of a task that another process finds by importing a module, else the name as it is."""
+    module = sys.modules.get(getattr(TASKS.get(task), "__module__", ""))
     name = getattr(module, "__name__", "")
     importable = name.isidentifier() and name != "__main__" and getattr(module, "__file__", None) is not None
     return f"{name}:{task}" if importable else task

@@ -36,6 +36,8 @@ from torchmpm.checks import Segment
 from torchmpm.tree import transforming
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
+#: Simulations in which a task's functions are tried.
+TRIALS = 3
 RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
@@ -67,7 +69,6 @@ class TorchEnv:
             ``None`` stands for ``"image"``.
         resample: Draw new particles at every reset, not only at a seeded one; no effect where
             ``TaskSpec.starts_alike``.
-        deterministic: Accept only what repeats bit by bit, gradients included, which excludes CUDA.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
         conditions: Ranges from which each episode draws its start, the constants of its matter and its disturbances, a
             :class:`dittogym.Conditions` or a mapping with its fields; ``None``: all are the task's own.
@@ -120,20 +121,16 @@ class TorchEnv:
         backend: str = "auto",
         action_layout: ActionLayout | None = None,
         resample: bool = False,
-        deterministic: bool = False,
         segment: Segment = "auto",
         conditions: Conditions | Mapping[str, Any] | None = None,
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
         self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
-        for name, flag in (("resample", resample), ("deterministic", deterministic)):
-            checks.flag(name, flag)
+        checks.flag("resample", resample)
         if (name := str(dtype).removeprefix("torch.")) not in DTYPES:
             raise ValueError(f"dtype must be one of {tuple(DTYPES)}, got {name!r}")
         self.dtype, self.device = DTYPES[name], find_device(device)
-        if deterministic and self.device.type != "cpu":
-            raise ValueError(f"deterministic=True needs device 'cpu', got {device!r}")
         self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         if action_layout not in ("image", "grid", None):
@@ -144,8 +141,9 @@ class TorchEnv:
         random = self.model.full_size  # with full counts, both as in the reference
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
-        trial = InitialPositions(self.spec, counts, 2, random=False, resample=False)
-        self._task_state = core.check_rewards(self.model, trial.draw(0, np.ones(2, bool), None, self._like).positions)
+        trial = InitialPositions(self.spec, counts, TRIALS, random=False, resample=False)
+        positions = trial.draw(0, np.ones(TRIALS, bool), None, self._like).positions
+        self._task_state = core.check_rewards(self.model, positions)
         self.device = self._like.device  # "cuda" with the number of the current device
         self._physics: Physics = {}
         self.conditions = as_conditions(conditions)
@@ -421,9 +419,9 @@ class TorchEnv:
             differentiable. The reward (B,). Whether the task ended the episode, ``terminated`` (B,) bool. Whether the
             horizon is reached, ``truncated`` (B,) bool. And ``info`` with a leading B throughout: ``reward_terms``,
             the weighted terms of the reward by name, (B,) each; ``com`` (B, 2), the robot's centre of mass, m;
-            ``split`` (B,), its radius of gyration, m; ``finite`` (B,) bool, false if a number is not finite or all of
-            the robot is outside the window; ``object_com`` (B, 2), m, in tasks with an object; ``is_success`` (B,) bool
-            in tasks that define it; and the task's own quantities.
+            ``split`` (B,), its radius of gyration, m; ``finite`` (B,) bool, false if a number is not finite, matter is
+            :data:`dittogym.core.FAR` away, or all of the robot is outside the window; ``object_com`` (B, 2), m, in
+            tasks with an object; ``is_success`` (B,) bool in tasks that define it; and the task's own quantities.
 
         Raises:
             ValueError: The action has the wrong shape or type or, on the CPU, is not finite.

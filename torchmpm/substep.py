@@ -17,7 +17,7 @@ from torchmpm.grid import Grid
 from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
-from torchmpm.transfer import Stencil, stencil
+from torchmpm.transfer import Stencil
 
 #: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
 MASS_EPSILON = 1e-10
@@ -62,7 +62,7 @@ class Scene:
 class Scattered(NamedTuple):
     """Result of the first half of a substep."""
 
-    nodes: Stencil
+    stencil: Stencil
     inside: Tensor  # (B, N) which particles take part
     F: Mat2  # (B, N) each, the returned deformation gradient
     Jp: Tensor  # (B, N) plastic volume ratio
@@ -86,7 +86,7 @@ def substep(scene: Scene, state: Components, boundary: Callable[[Scene, Tensor],
     state = _detach_unresolved(scene, state)
     scattered = particles_to_grid(scene, state)
     velocity = boundary(scene, grid_velocity(scene, scattered.momentum))
-    v, C = transfer.grid_to_particles(scene.grid, scattered.nodes, velocity)
+    v, C = transfer.grid_to_particles(scene.grid, scattered.stencil, velocity)
     x, y = state[:2]
     moved = (x + scene.dt * v[0], y + scene.dt * v[1], *v, *C, *scattered.F, scattered.Jp)
     return tuple(torch.where(scattered.inside, new, old) for new, old in zip(moved, state, strict=True))
@@ -97,20 +97,20 @@ def particles_to_grid(scene: Scene, state: Components) -> Scattered:
     x, y, *others = state
     dt, grid = scene.dt, scene.grid
     inside = grid.takes_part(x, y, scene.origin)
-    nodes = stencil(grid, x, y, scene.origin)
+    stencil = transfer.stencil(grid, x, y, scene.origin)
     # Particles outside get neutral values: zero times NaN would reach the derivatives of constants that all share.
     neutral = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0)  # v, C, F and Jp at rest
     still = (torch.where(inside, component, number) for component, number in zip(others, neutral, strict=True))
     vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = still
     trial = matmul((1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3), (f0, f1, f2, f3))
-    F, Jp, stress_momentum = _deform(scene, nodes, inside, trial, Jp)
+    F, Jp, stress_momentum = _deform(scene, stencil, inside, trial, Jp)
     momentum = transfer.particles_to_grid(
-        grid, nodes, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, stress_momentum
+        grid, stencil, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, stress_momentum
     )
-    return Scattered(nodes, inside, F, Jp, momentum)
+    return Scattered(stencil, inside, F, Jp, momentum)
 
 
-def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
+def _deform(scene: Scene, stencil: Stencil, inside: Tensor, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
     """Returned deformation gradient, plastic volume ratio and ``-dt V 4/h^2 tau`` of all bodies."""
     parts: list[tuple[Tensor, ...]] = []
     for body, part in slices(scene.bodies):
@@ -119,7 +119,7 @@ def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tenso
         F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
         tau = _stress(scene, body, F, before)
         if body.muscle and scene.actuation is not None:
-            pulls = transfer.interpolate(nodes.part(part), scene.actuation)
+            pulls = transfer.interpolate(stencil.part(part), scene.actuation)
             ax, ay = (torch.where(inside[:, part], pull, 0.0) for pull in pulls)
             active = muscle_stress(F, (ax, ay))
             tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -65,7 +66,9 @@ def check_task(task: object) -> None:
             except Exception as error:  # whatever the module does
                 absent = getattr(error, "name", None) == module
                 where = ", neither in the working directory nor on the Python path" if absent else ""
-                reason = f" (module {module!r}: {type(error).__name__}: {error}{where})"
+                last = traceback.extract_tb(error.__traceback__)[-1]
+                line = "" if last.filename.startswith("<") else f", line {last.lineno} of {last.filename}"
+                reason = f" (module {module!r}: {type(error).__name__}: {error}{where}{line})"
             else:
                 reason = _registration_fault(task, module, name)
         if not reason and name in TASKS:

@@ -133,6 +133,11 @@ def returned(weights=None, start=None, **changes):
     return env(task=spec(reward_fn=reward_fn, weights=weights or {"height": 1.0}, initial_task_state=remember))
 
 
+def height_of_one(transition, spec):
+    """A mistake: the second simulation in place of the second axis."""
+    return Reward({"height": transition.now.com[1]})
+
+
 def json_of(shape):
     """An environment that is made again from the JSON of its specification."""
     made = gymnasium.make(ID, body=shape, **SMALL).spec.to_json()
@@ -341,13 +346,14 @@ VALUES = [
     ("weights['action']", lambda: spec(weights={"action": -2e-4})),
     ("weights", lambda: returned({"heigth": 7.0})),
     ("weights", lambda: returned({"height": 7.0, "alve": 1.0})),
-    ("'height'", lambda: returned(terms={"height": torch.zeros(3)})),
-    ("finite terms", lambda: returned(terms={"height": torch.tensor([1.0, torch.nan])})),
-    ("terms", lambda: returned(terms={"alive": torch.zeros(2)})),
+    ("'height'", lambda: returned(terms={"height": torch.zeros(2)})),
+    ("'height'", lambda: env(task=spec(reward_fn=height_of_one, weights={"height": 1.0}))),
+    ("finite terms", lambda: returned(terms={"height": torch.tensor([1.0, torch.nan, 1.0])})),
+    ("terms", lambda: returned(terms={"alive": torch.zeros(3)})),
     ("terminated", lambda: returned(terminated=torch.zeros(2, 2, dtype=torch.bool))),
-    ("success", lambda: returned(success=torch.zeros(2))),
-    ("info", lambda: returned(info={"com": torch.zeros(2)})),
-    ("'_risen'", lambda: returned(info={"_risen": torch.zeros(2)})),
+    ("success", lambda: returned(success=torch.zeros(3))),
+    ("info", lambda: returned(info={"com": torch.zeros(3)})),
+    ("'_risen'", lambda: returned(info={"_risen": torch.zeros(3)})),
     ("'risen'", lambda: returned(info={"risen": 1.0})),
     ("task_state", lambda: returned(task_state={"first": torch.zeros(2)})),
     ("initial_task_state", lambda: returned(start={"peak": 1.0})),

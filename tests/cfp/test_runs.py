@@ -1,9 +1,12 @@
 """Training from Python is training from the command line."""
 
+import importlib
 import io
 import sys
+from unittest import mock
 
 import cv2
+import gymnasium
 import matplotlib
 import pytest
 from short_episodes import HORIZON
@@ -13,6 +16,8 @@ from watching import at_step, interrupt
 import cfp
 from cfp import registry
 from cfp.policy import read_policy
+from cfp.train import from_python
+from dittogym import TASKS
 
 pytestmark = pytest.mark.usefixtures("short")
 
@@ -49,6 +54,19 @@ def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finishe
     assert run.evaluations == cfp.Run(finished).evaluations == [*rows[:4], rows[-1]]
     assert_same_run(folder, finished, (*TABLES, "policy.safetensors", "config.json"))
     assert capfd.readouterr() == ("", "")
+
+
+def test_other_programs_find_the_task_of_a_module(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "ledges.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def ledge(): return dataclasses.replace(dittogym.make_spec('run'), name='ledge')\n"
+        "dittogym.register('ledge', ledge)"
+    )
+    with mock.patch.dict(TASKS), mock.patch.dict(gymnasium.registry):
+        importlib.import_module("ledges")
+        assert from_python({"task": "ledge"}, None, False).run.task == "ledges:ledge"
+        assert from_python({"task": "run"}, None, False).run.task == "run"
 
 
 class Bare:

@@ -1,5 +1,6 @@
 """Batches: equal to single environments, repeatable, and no element harms another; for every task."""
 
+import dataclasses
 import itertools
 import random
 from functools import partial
@@ -9,6 +10,7 @@ import pytest
 import torch
 from tiny import ALL, FIXED, TASKS, actions, assert_same_bits, episode, everything, leaves, set_particles, stir, tiny
 
+import dittogym
 from dittogym import TorchEnv, core
 from dittogym.core import FAILURE_REWARD
 
@@ -62,7 +64,7 @@ def test_a_batch_is_its_single_environments(task: str, given: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_repeats_bit_by_bit(task: str) -> None:
-    env = partial(tiny, task, 2, particles=300, substeps=10, dtype="float32", deterministic=True)
+    env = partial(tiny, task, 2, particles=300, substeps=10, dtype="float32")
     assert_same_bits(episode(env(), 11), episode(env(), 11))
 
 
@@ -155,6 +157,16 @@ def test_a_reset_of_no_element_changes_nothing(backend: str) -> None:
     before, _ = env.reset(seed=0)
     seen, _ = env.reset(options={"reset_mask": [False, False]})
     assert torch.equal(seen, before)
+
+
+def test_a_simulation_that_blows_up_ends() -> None:
+    env = tiny(dataclasses.replace(dittogym.make_spec("run"), max_actuation=1e3), 2, particles=300, substeps=100)
+    env.reset(seed=0)
+    action = torch.zeros(2, *env.action_shape)
+    action[1] = 2.0 * torch.rand(env.action_shape, generator=torch.Generator().manual_seed(0)) - 1.0
+    _, reward, terminated, _, info = env.step(action)
+    assert info["finite"].tolist() == [True, False] and terminated.tolist() == [False, True]
+    assert reward[0] > 0 and reward[1] == core.FAILURE_REWARD and env.state.is_finite().all()
 
 
 @pytest.mark.parametrize("shift", [(3.0, 0.0), (0.0, -3.0), (0.0, 3.0)])

@@ -134,9 +134,12 @@ private:
         const bool last = s == robot.given.substeps;
         Streamed::for_own(robot, [&](int index) {
             Particle bar = particles.from(last ? robot.given.result_bar : robot.given.components_bar, index);
-            if (!last) reverse.take(particles.at_start_of(s, index), bar, index, robot.body_of(index));
+            if (!last)
+                reverse.particle_to_grid_adjoint(particles.at_start_of(s, index), bar, index, robot.body_of(index));
             particles.to(robot.given.components_bar, index, bar);
-            if (s > 0) reverse.give(tape.state(s - 1, X, index), tape.state(s - 1, Y, index), bar, window);
+            if (s > 0)
+                reverse.grid_to_particle_adjoint(
+                    tape.state(s - 1, X, index), tape.state(s - 1, Y, index), bar, window);
         });
     }
 

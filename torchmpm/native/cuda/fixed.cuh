@@ -5,7 +5,7 @@
 // The unit of mass follows the heaviest node, and the unit of momentum the fastest particle, both of the substep
 // before. With V at least the speed that a particle lends to any of its nodes, |w q| / unit of momentum <= w m / unit
 // of mass: where the mass of a node is rounded to nothing, so is its momentum, and no velocity is larger than V.
-// Particles that are faster than this range are not added, see Substep::give.
+// Particles that are faster than this range are not added, see Substep::scatter.
 #pragma once
 #include "machine.cuh"
 

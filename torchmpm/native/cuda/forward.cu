@@ -31,7 +31,7 @@ public:
     INLINE void finish(const Substep& substep) const {
         for_own([&](int k, int index) {
             Particle p = recall(k, index);
-            if (substep.take(p)) write_motion(p, index);
+            if (substep.grid_to_particle(p)) write_motion(p, index);
             write({p.x, p.y, p.F, SNOW ? p.Jp : robot.given.components[at(JP, index)]}, index);
         });
     }

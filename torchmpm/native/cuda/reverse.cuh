@@ -15,7 +15,7 @@ public:
     INLINE void clear() { origin_bar[0] = origin_bar[1] = gain_bar[0] = gain_bar[1] = 0; }
 
     // Adjoint of G2P: derivatives in the velocities of the nodes around a particle whose state was at `x`, `y`.
-    INLINE void give(Real x, Real y, const Particle& bar, const Window& window) const {
+    INLINE void grid_to_particle_adjoint(Real x, Real y, const Particle& bar, const Window& window) const {
         const Place at = locate(robot.domain, x, y);
         if (!at.on) return;
         const Real dt = robot.dt, slope = 4 * robot.domain.inverse_h;
@@ -34,16 +34,16 @@ public:
 
     // Adjoint of P2G and of the weights of both transfers: turns the derivatives in the state after the substep into
     // those in the state before it.
-    INLINE void take(const Particle& state, Particle& bar, int index, int body_index) {
+    INLINE void particle_to_grid_adjoint(const Particle& state, Particle& bar, int index, int body_index) {
         const Body& body = robot.bodies[body_index];
         const Place at = locate(robot.domain, state.x, state.y);
         if (at.on) {
             if (has_kind<Kind::von_mises>(body.kind))
-                take_as<Kind::von_mises>(state, bar, at, body, index);
+                adjoint_as<Kind::von_mises>(state, bar, at, body, index);
             else if (has_kind<Kind::snow>(body.kind))
-                take_as<Kind::snow>(state, bar, at, body, index);
+                adjoint_as<Kind::snow>(state, bar, at, body, index);
             else
-                take_as<Kind::elastic>(state, bar, at, body, index);
+                adjoint_as<Kind::elastic>(state, bar, at, body, index);
         }
         if (has_kind<Kind::snow>(body.kind) && unresolved(body.bounds, state.C)) bar = {};
     }
@@ -73,7 +73,7 @@ public:
 
 private:
     template <Kind kind>
-    INLINE void take_as(const Particle& state, Particle& bar, const Place& at, const Body& body, int index) {
+    INLINE void adjoint_as(const Particle& state, Particle& bar, const Place& at, const Body& body, int index) {
         const Values m = robot.values_of(body, index);
         const Real dt = robot.dt, h = robot.h, slope = 4 * robot.domain.inverse_h;
         const Nodes& nodes = robot.nodes;

@@ -35,8 +35,8 @@ INLINE int advance(Robot& robot, Substep& substep, Particles& particles, const T
     for (int s = -1; s < substeps; ++s) {
         Survey survey;
         particles.each(s, [&](Particle& p, int index, int body) {
-            const bool takes_part = s <= 0 || substep.take(p);
-            return takes_part && !substep.give(p, index, body, s >= 0, survey) && s >= 0;
+            const bool takes_part = s <= 0 || substep.grid_to_particle(p);
+            return takes_part && !substep.particle_to_grid(p, index, body, s >= 0, survey) && s >= 0;
         });
         survey.join_particles(team, s);
         team.wait_and_summarise<GIVEN>(s);

@@ -91,7 +91,7 @@ public:
     INLINE Place locate(const Particle& p) const { return ::locate(robot.domain, p.x, p.y); }
 
     // G2P; returns whether the particle takes part.
-    INLINE bool take(Particle& p) const {
+    INLINE bool grid_to_particle(Particle& p) const {
         const Place at = locate(p);
         if (!at.on) return false;
         const Moments m = read(robot.nodes.velocity, before, at);
@@ -104,12 +104,12 @@ public:
 
     // P2G: deform, and give mass and momentum to the nodes; returns whether the particle takes part. `survey` gets
     // where it is and how fast; `keep` is false for a trial without effect on the particle.
-    INLINE bool give(Particle& p, int index, int body_index, bool keep, Survey& survey) const {
+    INLINE bool particle_to_grid(Particle& p, int index, int body_index, bool keep, Survey& survey) const {
         const Place at = locate(p);
         if (!at.on) return false;
         survey.include(at.i, at.j);
         if (robot.window.holds(at.i, at.j))
-            give(p, at, index, robot.bodies[body_index], keep, survey);
+            scatter(p, at, index, robot.bodies[body_index], keep, survey);
         else
             survey.fail(LEFT_WINDOW);
         return true;
@@ -131,7 +131,7 @@ private:
         Real x, y, xx, xy, yx, yy;  // momentum, and its change per cell
     };
 
-    INLINE void give(Particle& p, const Place& at, int index, const Body& body, bool keep, Survey& survey) const {
+    INLINE void scatter(Particle& p, const Place& at, int index, const Body& body, bool keep, Survey& survey) const {
         const Values m = robot.values_of(body, index);
         const Pair act = actuation(robot, body, at);
         Mat2 F = p.F;
