@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import typing
 from collections.abc import Mapping
@@ -625,7 +626,9 @@ def update_from_dict(base: Value, values: Any) -> Value:
     changes: dict[str, Any] = {}
     for name, value in values.items():
         if name not in names:
-            raise ConfigError(f"{name} is not an option; options are {', '.join(names)}")
+            near = difflib.get_close_matches(str(name), names)
+            allowed = f"did you mean {' or '.join(near)}?" if near else f"options are {', '.join(names)}"
+            raise ConfigError(f"{name} is not an option; {allowed}")
         hint, value = hints[name], tuple(value) if isinstance(value, list) else value
         parts = value if isinstance(value, tuple) else (value,)
         if typing.get_args(hint)[1:] == (...,):  # one value for all stages

@@ -76,7 +76,8 @@ def _checked_range(name: str, given: Any) -> Range:
             low, high = (None if end is None else int(end) for end in given)
             return low, high
     raise ValueError(
-        f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, got {given!r}"
+        f"{name} must be an inclusive range (low, high) of node indices, whole numbers or None, with low <= high, "
+        f"got {given!r}"
     )
 
 
