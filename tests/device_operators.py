@@ -1,4 +1,4 @@
-"""What a function would launch on a GPU, and where it would wait for one, counted on tensors of the CPU."""
+"""Where a function would wait for a GPU, counted on tensors of the CPU."""
 
 from __future__ import annotations
 
@@ -12,12 +12,6 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-#: Operators that return a view, memory without content, or a tensor as it is: they launch nothing.
-FREE = set(
-    "alias as_strided detach diagonal empty empty_like empty_strided expand lift_fresh movedim new_empty "
-    "new_empty_strided permute select set_data slice split split_with_sizes squeeze t transpose unbind unfold "
-    "unsqueeze view view_as _reshape_alias _unsafe_view _has_same_storage_numel _local_scalar_dense".split()
-)
 #: Operators that wait for the device, because the host needs a number or a size from it.
 WAITS = set(
     "_local_scalar_dense is_nonzero item nonzero equal masked_select unique2 _unique2 unique_dim repeat_interleave "
@@ -29,21 +23,18 @@ DOWNLOADS = {Tensor.cpu, Tensor.numpy, Tensor.tolist, Tensor.__array__}
 
 
 class DeviceOperators:
-    """Records the operators of a block.
+    """Records where a block waits.
 
     The tensors lie on the CPU, so code that asks for the device of a tensor takes another way than on CUDA. There are
     three such places around the physics: the observation, which the C++ function draws as the CUDA kernel does, in one
-    call (that :attr:`launches` does not count); actions of a single simulation, so count with two or more; and the
-    check whether an action is finite, see ``on_a_gpu`` in test_device.py. The physics is a call into C++, which is not
-    counted either.
+    call; actions of a single simulation, so count with two or more; and the check whether an action is finite, see
+    ``on_a_gpu`` in test_device.py. The physics is a call into C++, which is not counted.
 
     Attributes:
-        launches: Operators that launch a kernel or copy on the device.
         waits: Operators and functions that wait for the device, or copy to it from memory of the host.
     """
 
     def __init__(self) -> None:
-        self.launches: Counter[str] = Counter()
         self.waits: Counter[str] = Counter()
         self._modes = (_Functions(self), _Operators(self))
 
@@ -84,8 +75,6 @@ class _Operators(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if name in WAITS or (name.startswith("index") and _masked(args)):
             self.record.waits[name] += 1
-        if name not in FREE:
-            self.record.launches[name] += 1
         return func(*args, **(kwargs or {}))
 
 

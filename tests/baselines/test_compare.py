@@ -16,7 +16,7 @@ import pytest
 from filelock import FileLock
 
 import baselines
-from baselines.compare import paper, processes, worker
+from baselines.compare import processes, worker
 from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
 from baselines.compare.plan import PlannedRun, make_runs, read_plan, to_words
@@ -441,10 +441,3 @@ def test_evaluations_under_another_protocol_do_not_count(tmp_path):
     write_text(run.folder / "policy.safetensors", "another")
     assert read_result(run, Protocol(2)).state == "not evaluated"
     assert [Protocol().deterministic(task) for task in ("shapematch", "run", "module:own")] == [True, False, False]
-
-
-def test_numbers_of_the_paper_are_complete():
-    assert paper.CURVES.keys() == paper.REST.keys()
-    assert all(len(values) == len(paper.COLUMNS) for values in paper.CURVES.values())
-    assert paper.normalised("run", 2500) == 0 and paper.normalised("run", 8650) == 1
-    assert paper.WITHOUT_NOISE == ("shapematch",)

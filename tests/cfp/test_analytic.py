@@ -58,12 +58,6 @@ def test_a_reward_that_is_not_finite_ends_the_training(own_task, tmp_path):
         update(learner)
 
 
-def test_can_train_with_longer_substeps_than_it_is_evaluated_with(tmp_path):
-    for train_dt, expected in ((2e-4, (2e-4, 2)), (None, (1e-4, 4))):
-        model = CFPAnalytic.create(make(train_dt=train_dt), 1, tmp_path).simulation.model
-        assert (model.solver.dt, model.substeps) == expected
-
-
 def parameters(module):
     return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 

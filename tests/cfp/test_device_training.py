@@ -15,12 +15,9 @@ from stable_baselines3.common.logger import Logger
 from tiny_runs import resume, run
 
 from cfp import CFP, CFPPolicy, registry, train
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.actor import ActorSpec
 from cfp.analytic import window
-from cfp.analytic.critic import Critic, mlp
-from cfp.analytic.learner import ImageMemory, Regression
-from cfp.analytic.window import Window
-from cfp.config import Hyperparameters, WindowConfig, to_words
+from cfp.config import Hyperparameters, to_words
 from cfp.envs import make as envs
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError, NonFiniteError
@@ -53,26 +50,6 @@ def test_an_update_of_soft_actor_critic_waits_for_nothing():
     with DeviceOperators() as device:
         model.read_updates()
     assert device.waits
-
-
-def test_updates_by_gradients_wait_for_nothing():
-    actor, critic = build_actor(SPEC), mlp(5, 1)
-    actor.fix_std()
-    memory = ImageMemory(12, (torch.zeros(3, 64, 64, dtype=torch.uint8), torch.zeros(4, 8, 8)))
-    memory.add(torch.zeros(6, 3, 64, 64, dtype=torch.uint8), torch.zeros(6, 4, 8, 8))
-    regression, generator = Regression(actor, 1e-3, 0.9, 1.0), torch.Generator()
-    values = Critic(critic, WindowConfig(task="run", algo="shac", critic_updates=2))
-    for adam in (regression.adam, values.adam):
-        adam.param_groups[0]["fused"] = True  # as on a GPU; others count their steps on the host
-    seen = Window(torch.randn(4, 3, 5), torch.randn(4, 3), torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.bool), 0.0)
-    regression.update(*memory.sample(4, generator), 1e-3)
-    with DeviceOperators() as device:
-        for _ in range(3):
-            regression.update(*memory.sample(4, generator), 1e-3)
-    assert not device.waits
-    with DeviceOperators() as device:
-        values.update(seen, 1e-3)
-    assert device.waits.total() == 2  # whether the gradients were finite, and the loss to log, once a window
 
 
 def test_training_on_the_device_stores_and_returns_what_arrays_do():

@@ -157,11 +157,6 @@ def test_a_reward_that_is_not_finite_ends_an_evaluation():
         evaluate([fake_trial(Counting(), 2, faults={3: "reward"})], 4)
 
 
-def test_a_policy_can_be_evaluated_with_other_substeps():
-    config, _ = Command(policy="run", dt=2e-4).open()
-    assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
-
-
 def test_the_seed_chooses_the_episodes():
     assert [Command(policy="run", seed=seed).open()[0].seed for seed in (7, None)] == [7, 0]
 

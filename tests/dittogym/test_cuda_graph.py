@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 import torch
-from device_operators import DeviceOperators
-from test_device import on_a_gpu
 from tiny import TASKS, actions, assert_same_bits, begun, everything, forget, tiny
 from torch.utils._python_dispatch import _disable_current_modes
 
@@ -165,14 +163,3 @@ def test_a_pointer_is_a_use() -> None:
     for _ in range(WARM_UP + 1):
         replayed(torch.zeros(2))
     assert replayed._recording is not None and any(tensor is table for tensor in replayed._recording.constants)
-
-
-@pytest.mark.parametrize("task", ["run", "shapematch", "dig"])
-@torch.no_grad()
-def test_few_launches_around_the_physics(task: str) -> None:
-    """Once a step is replayed, what is left are copies, checks and the task's own reward."""
-    env = begun(recorded(on_a_gpu(tiny(task, 3))))
-    for given in actions(env, WARM_UP + 2):
-        with DeviceOperators() as seen:
-            env.step(given)
-    assert sum(seen.launches.values()) < 60 and not seen.waits

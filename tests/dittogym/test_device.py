@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from device_operators import DeviceOperators
-from stable_baselines3.common.vec_env import VecEnv
-from tiny import ALL, SMALL, TASKS, actions, assert_same_bits, begun, make_vec, tiny
+from tiny import ALL, TASKS, actions, assert_same_bits, begun, tiny
 
-from cfp.envs.vec_env import TorchVecEnv
 from dittogym import TorchEnv, copies, core
 
 #: A reset of some elements copies to the host what the mask is, unless that lies there, and nothing else.
@@ -26,40 +22,6 @@ def on_a_gpu(env: TorchEnv) -> TorchEnv:
     """The environment with the check of actions that it has on a GPU, after steps that leave its constants there."""
     env._nonfinite_action = torch.zeros((), dtype=env.dtype)
     return env
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: float(x.sum()),
-        lambda x: bool((x > 0).any()),
-        lambda x: x[x > 0],
-        lambda x: x.nonzero(),
-        lambda x: torch.equal(x, x),
-        lambda x: x.unique(),
-        lambda x: x.masked_select(x > 0),
-        lambda x: x.cpu(),
-        lambda x: x.tolist(),
-        lambda x: x.new_tensor([1.0]),
-        lambda x: torch.as_tensor(np.ones(2), device=x.device),
-        lambda x: torch.tensor([1.0], device=x.device),
-        lambda x: x.repeat_interleave(torch.ones_like(x).long()),
-        lambda x: x.clone().index_put_((x > 0,), x[0]),
-    ],
-)
-def test_what_would_wait_is_noticed(function: Callable[[torch.Tensor], object]) -> None:
-    with DeviceOperators() as seen:
-        function(torch.arange(4.0))
-    assert seen.waits
-
-
-def test_what_would_not_wait_is_only_counted() -> None:
-    x, index = torch.arange(4.0), torch.tensor([0, 2])
-    with DeviceOperators() as seen:
-        torch.where(x > 0, x[index].sum(), 1.0)[:2].view(1, 2)
-        torch.zeros(3, device=x.device)
-        torch.tensor([1.0], device="cpu")
-    assert not seen.waits and sum(seen.launches.values()) == 6
 
 
 @pytest.mark.parametrize("conditions", [None, ALL])
@@ -112,31 +74,6 @@ def test_large_actions_are_finite() -> None:
     env = begun(on_a_gpu(tiny("run", 2)))
     env.step(torch.full((2, *env.action_shape), torch.finfo(env.dtype).max, dtype=env.dtype))
     env.reset()
-
-
-def test_interfaces_of_arrays_wait_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For the numbers of a step, apart from images, which are copied on their own."""
-    copied: list[tuple[str, ...]] = []
-    plain = copies.to_host
-
-    def to_host(tensors: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
-        found = plain(tensors)
-        if tensors:
-            copied.append(tuple(tensors))
-            assert_same_bits(copies.unpack(copies.pack(tensors).numpy(), tensors), found)
-        return found
-
-    monkeypatch.setattr("dittogym.env.to_host", to_host)
-    single, batch = gymnasium.make("dittogym/run-coarse-v0", **SMALL), make_vec("run", 2)
-    vec: VecEnv = TorchVecEnv(tiny("kick", 2), max_episode_steps=2, stagger=True)
-    single.reset(seed=0), batch.reset(seed=0), vec.reset()
-    for env in (single, batch):
-        copied.clear()
-        env.step(np.zeros(env.action_space.shape, np.float32))
-        assert len(copied) == 2 and copied[1] == ("",)  # numbers, then images
-    copied.clear()
-    vec.step(np.zeros((2, *vec.action_space.shape), np.float32))  # the first episode ends after a step
-    assert len(copied) == 3 and copied[1] == copied[2] == ("",)
 
 
 def test_packed_numbers_are_the_same() -> None:

@@ -101,11 +101,19 @@ def test_tiny_yield_stress_is_finite() -> None:
         assert gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("material", [Elastic(MU, LAM), VonMises(MU, LAM, YIELD)], ids=["elastic", "von mises"])
-def test_stress_is_the_derivative_of_the_energy(material: Elastic) -> None:
+@pytest.mark.parametrize(
+    ("material", "hardened"),
+    [
+        (Elastic(MU, LAM), 1.0),
+        (VonMises(MU, LAM, YIELD), 1.0),
+        *((Snow(MU, LAM, shear_cutoff=0.0), Jp) for Jp in (0.95, 1.0, 1.05)),
+    ],
+    ids=["elastic", "von mises", "hardened snow", "snow", "softened snow"],
+)
+def test_stress_is_the_derivative_of_the_energy(material: Elastic, hardened: float) -> None:
     """Kirchhoff: tau = (d energy / d F) F^T."""
     F = deformations(500, 0.2, 3.0, seed=8, share_inverted=0.0).requires_grad_()
-    Jp = torch.ones(1, 500, dtype=torch.float64)
+    Jp = torch.full((1, 500), hardened, dtype=torch.float64)
     (first_piola,) = torch.autograd.grad(material.energy(planes(F), Jp).sum(), F)
     tau = symmetric(material.stress(planes(F.detach()), Jp))
     torch.testing.assert_close(tau, first_piola @ F.detach().mT, rtol=1e-12, atol=1e-9)

@@ -175,11 +175,13 @@ def cut(patch: pytest.MonkeyPatch, solver: Solver, count: int, substeps: int) ->
 
 
 @pytest.mark.parametrize("pieces", [False, True])
-@pytest.mark.parametrize("batch", [1, 3])
-def test_threads_make_no_difference(batch: int, pieces: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("batch", "dtype"), [(1, torch.float64), (3, torch.float64), (3, torch.float32)])
+def test_threads_make_no_difference(
+    batch: int, dtype: torch.dtype, pieces: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bit by bit: sums are taken in one order, also over the particles or simulations that share a constant."""
     given = state_leaves(2700, batch) | value_leaves(2700, batch)
-    leaves = {name: value.requires_grad_() for name, value in given.items()}
+    leaves = {name: value.to(dtype).requires_grad_() for name, value in given.items()}
     start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(2700, leaves), backend="native")
     before, results = torch.get_num_threads(), []
     if pieces:

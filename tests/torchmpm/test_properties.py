@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scenes import assert_close, assert_identical, generator
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, diagnostics
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, diagnostics, tree
 from torchmpm.native.library import find_compiler
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -161,10 +161,13 @@ def test_uniform_motion_goes_unnoticed(case: Case, across: float, up: float) -> 
     assert_close(back, resting.state, 1e-6)
 
 
-@settings(max_examples=15)
-@given(cases(), st.randoms(use_true_random=False))
-def test_elements_of_a_batch_do_not_know_each_other(case: Case, random) -> None:
+@settings(max_examples=25)
+@given(cases(), st.randoms(use_true_random=False), st.sampled_from([torch.float32, torch.float64]))
+def test_elements_of_a_batch_do_not_know_each_other(case: Case, random, dtype: torch.dtype) -> None:
     """Each as if alone, in any order: natively to the last bit, else to rounding."""
+    dtype = dtype if scenes.BACKEND == "native" else torch.float64
+    tensors = tree.map(lambda t: t.to(dtype), (case.state, case.actuation, case.origin))
+    case = Case(case.solver, *tensors)
     order = list(range(case.state.batch_size))
     random.shuffle(order)
     shuffled = Case(case.solver, case.state[order], case.actuation[order], case.origin[order]).run()

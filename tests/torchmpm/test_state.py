@@ -27,7 +27,6 @@ def test_at_rest_is_undeformed_and_without_velocity() -> None:
     assert torch.equal(state.Jp, torch.ones(3, 5))
     assert (state.batch_size, state.num_particles, state.dtype) == (3, 5, torch.float32)
     assert state.device == x.device
-    assert repr(state) == "ParticleState(batch_size=3, num_particles=5, dtype=torch.float32, device='cpu')"
     state.F[1, 2].mul_(1.5)  # the fields have memory of their own
     assert state.F.sum() == 2.0 * 15.0 + 1.0
 
