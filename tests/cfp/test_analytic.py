@@ -81,6 +81,30 @@ def test_trains_on_cuda_and_goes_on_on_the_cpu(tmp_path):
     assert np.isfinite(update(there)[0]["train/reward"])
 
 
+def test_an_update_remembers_each_image_with_an_action_that_earns_more(tmp_path):
+    rewards_alone = {"reward": "task", "split_weight": 0.0, "integrity_weight": 0.0, "gamma": 1.0, "minibatches": 0}
+    learner = CFPAnalytic.create(make(dtype="float64", **rewards_alone), 1, tmp_path)
+    for weight in learner.critic.target.parameters():
+        torch.nn.init.zeros_(weight)
+    env, steps = learner.simulation, learner.config.window
+    start = env.env_state
+    update(learner)
+    count = steps * learner.n_envs
+    images, improved = learner.memory.images[:count], learner.memory.locations[:count]
+    with torch.no_grad():
+        outputs = learner.actor.outputs(images, deterministic=True)
+    step = improved - outputs.location
+    assert step.square().mean().sqrt().item() == pytest.approx(0.1, rel=1e-3)
+
+    def earned(locations):
+        env.env_state = start
+        with torch.no_grad():
+            actions = learner.actor.act(outputs.at(locations), deterministic=True).action.unflatten(0, (steps, -1))
+            return sum(env.step(action, soft=True)[1] for action in actions)
+
+    assert (earned(improved) > earned(outputs.location)).all()
+
+
 def test_step_has_the_given_size_and_goes_down_the_gradient():
     torch.manual_seed(0)
     step, locations, gradients = ActionStep(), torch.zeros(4, 3, 2, 4, 4), torch.randn(4, 3, 2, 4, 4)

@@ -1,8 +1,10 @@
+import csv
 import json
 import subprocess
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,16 @@ from cfp.policy import check_trained_for, policy_file, write_policy
 from cfp.presets import sac_preset
 from cfp.sac.policies import CFPPolicy
 from dittogym.action import trained_layout
+
+#: Rows of returns with 2,000 particles from varied starts, see docs/policies.md.
+with open(Path(__file__).parents[2] / "docs" / "evaluations.csv", encoding="utf-8") as table:
+    ROWS = list(csv.DictReader(table))
+EVALUATED = [
+    row
+    for row in ROWS
+    if row["policy"] not in ("zero", "random")
+    and (row["case"], row["particles"], row["noise"]) == ("undisturbed", "lite", "with")
+]
 
 
 def images(count=3):
@@ -208,6 +220,14 @@ def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
     actions, _ = policy.predict(images(), deterministic=True)
     np.testing.assert_allclose(actions[0, 0, 0, :2], first, atol=1e-5)
     assert actions.sum(dtype=np.float64) == pytest.approx(total, abs=1e-3, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", EVALUATED, ids=lambda row: row["policy"])
+def test_shipped_policies_return_what_was_measured(row):
+    """Two episodes of their own starts, with 2,000 particles, lie among the hundred from varied starts."""
+    result = cfp.evaluate_policy(cfp.load(row["policy"]), row["task"], 2, particles="lite")
+    assert float(row["lowest"]) <= result.mean <= float(row["highest"])
 
 
 def test_representation_says_what_a_policy_is_for():
