@@ -167,12 +167,10 @@ def test_matter_that_flew_off_leaves_finite_what_is_seen():
 def test_networks_have_single_precision_whatever_that_of_torch_is(kind):
     """Double as torch's default, or less under autocast; so have the segments that they see."""
     torch.set_default_dtype(torch.float64)
-    try:
-        env = segmented()
-        actor = ModularActor(kind, env.nodes.num_features(env.env.spec))
-        rows, *_ = env.step(torch.zeros(2, 16, 2, dtype=torch.float32))
-    finally:
-        torch.set_default_dtype(torch.float32)
+    env = segmented()
+    actor = ModularActor(kind, env.nodes.num_features(env.env.spec))
+    rows, *_ = env.step(torch.zeros(2, 16, 2, dtype=torch.float32))
+    torch.set_default_dtype(torch.float32)
     assert {rows.dtype, *(parameter.dtype for parameter in actor.parameters())} == {torch.float32}
     with torch.autocast("cpu", torch.bfloat16):
         assert actor.sample(rows).action.dtype == torch.float32

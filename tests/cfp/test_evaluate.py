@@ -68,18 +68,13 @@ class Layouts(FakeEnv):
 )
 def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads, conditions):
     config = replace(preset("shapematch"), device="cpu", particles=200, substeps=2)
-    before = torch.get_num_threads()
     options = {"deterministic": False, "seed": 5, "conditions": conditions}
     trial = make_trial(config, "", LinearPolicy(), 4, **options)
     state = torch.get_rng_state()
-    try:
-        torch.set_num_threads(1)
-        alone = evaluate([trial], 8)[0]
-        torch.set_num_threads(threads)
-        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 3, **options), trial], 8)
-        assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(before)
+    alone = evaluate([trial], 8)[0]
+    torch.set_num_threads(threads)
+    _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 3, **options), trial], 8)
+    assert torch.get_num_threads() == threads
     assert together == alone and len(set(alone.returns)) == 4
     first, third = (make_trial(config, "", LinearPolicy(), 1, **options | {"seed": seed}) for seed in (5, 7))
     assert [result.episodes[0] for result in evaluate([first, third], 8)] == [alone.episodes[0], alone.episodes[2]]
@@ -140,15 +135,11 @@ def test_progress_of_a_long_evaluation_is_shown_where_there_is_no_terminal(secon
 
 def test_an_episode_that_fails_ends_the_others():
     before, policies = threading.active_count(), (Counting(), Counting(fails_after=3))
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        trials = [fake_trial(policy, 1, horizon=10**6 if k == 0 else 10) for k, policy in enumerate(policies)]
-        with pytest.raises(RuntimeError, match="had enough"):
-            evaluate(trials, 10**6)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
+    torch.set_num_threads(2)
+    trials = [fake_trial(policy, 1, horizon=10**6 if k == 0 else 10) for k, policy in enumerate(policies)]
+    with pytest.raises(RuntimeError, match="had enough"):
+        evaluate(trials, 10**6)
+    assert torch.get_num_threads() == 2
     assert threading.active_count() == before and policies[0].steps < 10**6
 
 

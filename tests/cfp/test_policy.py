@@ -68,16 +68,9 @@ def test_loaded_policy_acts_bit_for_bit_as_the_one_in_training(saved, name):
             assert actions[0].shape == (*observation.shape[:-3], 2, 64, 64)
 
 
-@pytest.fixture
-def double_precision():
-    """As torch's default."""
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
-
-
 @pytest.mark.parametrize("name", ["run", "kick"])
-def test_double_precision_as_default_changes_no_action(name, double_precision):
+def test_double_precision_as_default_changes_no_action(name):
+    torch.set_default_dtype(torch.float64)
     found = cfp.load(name).predict(images(), deterministic=True)[0]
     torch.set_default_dtype(torch.float32)
     np.testing.assert_array_equal(found, cfp.load(name).predict(images(), deterministic=True)[0])

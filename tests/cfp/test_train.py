@@ -66,11 +66,8 @@ def test_the_seed_of_a_run_chooses_its_first_weights(learner, tmp_path):
 @pytest.mark.parametrize("learner", OF_LEARNER)
 def test_networks_have_single_precision_whatever_that_of_torch_is(learner, precision, tmp_path):
     torch.set_default_dtype(torch.float64 if precision == "double" else torch.float32)
-    try:
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "autocast"):
-            assert run(tmp_path, *SHORT, learner=learner) == 0
-    finally:
-        torch.set_default_dtype(torch.float32)
+    with torch.autocast("cpu", torch.bfloat16, enabled=precision == "autocast"):
+        assert run(tmp_path, *SHORT, learner=learner) == 0
     weights, _ = read_policy(tmp_path)
     assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
 

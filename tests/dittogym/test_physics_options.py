@@ -26,10 +26,7 @@ def test_numbers_and_lists_are_as_exact_as_arrays() -> None:
     places = (env.state.x[0] + 1e-12).tolist()
     for default in (torch.float32, torch.bfloat16):
         torch.set_default_dtype(default)
-        try:
-            env.reset(options={"positions": places, "physics": {"mu": 650.1, "lam": [49.9, np.float32(50.0)]}})
-        finally:
-            torch.set_default_dtype(torch.float32)
+        env.reset(options={"positions": places, "physics": {"mu": 650.1, "lam": [49.9, np.float32(50.0)]}})
         assert env.env_state.physics["mu"].tolist() == [650.1] * 2
         assert env.env_state.physics["lam"].tolist() == [49.9, 50.0] and env.state.x[1].tolist() == places
 

@@ -183,16 +183,13 @@ def test_threads_make_no_difference(
     given = state_leaves(2700, batch) | value_leaves(2700, batch)
     leaves = {name: value.to(dtype).requires_grad_() for name, value in given.items()}
     start, solver = ParticleState(*(leaves[name] for name in STATE)), replace(varied(2700, leaves), backend="native")
-    before, results = torch.get_num_threads(), []
+    results = []
     if pieces:
         cut(monkeypatch, solver, 2700, 3)
-    try:
-        for threads in (1, 2, 2, 5):
-            torch.set_num_threads(threads)
-            final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
-            results.append((final.stack(), *torch.autograd.grad(loss(final), list(leaves.values()))))
-    finally:
-        torch.set_num_threads(before)
+    for threads in (1, 2, 2, 5):
+        torch.set_num_threads(threads)
+        final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
+        results.append((final.stack(), *torch.autograd.grad(loss(final), list(leaves.values()))))
     for result in results[1:]:
         assert all(map(torch.equal, result, results[0]))
 
@@ -210,12 +207,8 @@ def test_a_simulation_alone_has_the_gradients_it_has_in_a_batch(threads: int, mo
         final = solver.step(start, leaves["actuation"], substeps=8, origin=leaves["origin"])
         return torch.autograd.grad(final.stack().square().sum(), [leaves[name] for name in wanted])
 
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        together, alone = slopes(slice(None)), [slopes(slice(i, i + 1)) for i in range(3)]
-    finally:
-        torch.set_num_threads(before)
+    torch.set_num_threads(threads)
+    together, alone = slopes(slice(None)), [slopes(slice(i, i + 1)) for i in range(3)]
     assert all(map(torch.equal, together, map(torch.cat, zip(*alone, strict=True))))
 
 

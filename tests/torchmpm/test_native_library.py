@@ -226,12 +226,10 @@ def test_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_a_forked_process_keeps_its_threads_until_it_simulates() -> None:
     """Then it has a single thread, see ``tests/dittogym/test_concurrency.py``."""
-    threads = torch.get_num_threads()
     torch.set_num_threads(3)
     child = os.fork()
     if not child:
         before = torch.get_num_threads()
         library.leave_parent_threads()
         os._exit(10 * before + torch.get_num_threads())
-    torch.set_num_threads(threads)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 31
