@@ -30,7 +30,7 @@ def find(name: str) -> type[Learner]:
     module, _, attribute = ALGORITHMS.get(name, name).partition(":")
     if name not in ALGORITHMS and not (attribute and module.isidentifier()):  # files must not reach below the folder
         hint = "" if OTHER_NAMES else "; baselines.fit and baselines.Run know others"  # it has not been imported
-        allowed = f"one of {', '.join(ALGORITHMS)} or MODULE:CLASS"
+        allowed = f"one of {', '.join(ALGORITHMS)} or MODULE:CLASS (a module in one word, without dots)"
         raise ConfigError(OTHER_NAMES.get(name, f"algo must be {allowed}, got {name!r}{hint}"))
     try:
         algorithm = getattr(import_module(module), attribute)

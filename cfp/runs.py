@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from cfp import messages, registry
 from cfp.config import Particles, Preset, RunConfig
-from cfp.envs.make import choose_device
+from cfp.envs.make import all_generators_kept, choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.page import draw_curve
 from cfp.evaluation.returns import REPLAYED
@@ -179,7 +179,7 @@ def fit(
         algo: ``"cfp-analytic"`` or ``"cfp-sac"``; None for that of the preset. `baselines.fit` takes others.
         preset: ``"quick"``, ``"long"`` or ``"paper"``, see `cfp.preset`; None for quick.
         steps: Environment steps of all robots in all stages together.
-        seed: Seed of everything that is random; None for 0.
+        seed: Seed of everything that is random; None for that of the preset, which is 0 but for two tasks of paper.
         num_envs: Number of robots simulated side by side.
         particles: ``"full"`` (the paper's number), ``"lite"`` (about 2,000), the number of the robot's particles, or
             the numbers of robot and object.
@@ -222,7 +222,7 @@ def fit(
     command = from_python({"task": task, **options}, None if out is None else parse_folder("out", out), resume)
     keep_memory()
     try:
-        with printable(), messages.quiet(quiet):
+        with printable(), messages.quiet(quiet), all_generators_kept():
             train(command, "the same call with resume=True continues the run", on_evaluation)
     except Stopped as stopped:
         raise KeyboardInterrupt(str(stopped)) from None

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
 from torch import Tensor, nn
@@ -192,42 +192,24 @@ class Encoder(nn.Module):
         self.register_buffer("patches", F.unfold(grid[None], kernel, stride=stride)[0].T.contiguous(), persistent=False)
 
     def forward(self, *images: Tensor) -> Tensor:
-        """Encode images (B, c, size, size) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
-        return encode([self], *images)
+        """Encode images (B, c, size, size) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4).
 
-
-def encode(encoders: Sequence[Encoder], *images: Tensor) -> Tensor:
-    """Evaluate n encoders of the same shape on the same images (B, c, size, size); returns latents (B, n w, 4, 4).
-
-    One convolution a layer, with the channels of all encoders, is faster on a CPU than several small ones. The first
-    layer is linear in its channels, so that it is evaluated for each image and for the coordinates separately: no
-    constants are stacked with the images, and images that need no gradient get none.
-    """
-    sizes, stride = [image.shape[1] for image in images], encoders[0].first.stride[0]
-    weight, bias = _joined([encoder.first for encoder in encoders])
-    *weights, position = weight.split([*sizes, 2], dim=1)
-    coordinates = torch.addmm(bias, encoders[0].patches, position.flatten(1).T).flatten()
-    hidden, *others = (
-        (_folded_conv if image.requires_grad else F.conv2d)(_channels_last(image), part, stride=stride)
-        for image, part in zip(images, weights, strict=True)
-    )
-    # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
-    hidden += coordinates.expand(len(hidden), -1).unflatten(1, (15, 15, -1)).movedim(-1, 1)
-    for other in others:
-        hidden += other
-    for layers in zip(*(encoder.rest for encoder in encoders), strict=True):
-        if isinstance(layers[0], nn.Conv2d):
-            hidden = F.conv2d(hidden, *_joined(layers), stride=layers[0].stride, groups=len(encoders))
-        else:
-            hidden = layers[0](hidden)
-    return hidden
-
-
-def _joined(layers: Sequence[Any], dim: int = 0) -> tuple[Tensor, Tensor]:
-    """Weights and biases of layers of the same shape, weights concatenated along ``dim``."""
-    if len(layers) == 1:
-        return layers[0].weight, layers[0].bias
-    return torch.cat([layer.weight for layer in layers], dim), torch.cat([layer.bias for layer in layers])
+        The first layer is linear in its channels, so that it is evaluated for each image and for the coordinates
+        separately: no constants are stacked with the images, and images that need no gradient get none.
+        """
+        stride = self.first.stride[0]
+        *weights, position = self.first.weight.split([*(image.shape[1] for image in images), 2], dim=1)
+        coordinates = (self.patches @ position.flatten(1).T + self.first.bias).flatten()
+        hidden, *others = (
+            (_folded_conv if image.requires_grad else F.conv2d)(_channels_last(image), part, stride=stride)
+            for image, part in zip(images, weights, strict=True)
+        )
+        # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
+        hidden += coordinates.expand(len(hidden), -1).unflatten(1, (15, 15, -1)).movedim(-1, 1)
+        for other in others:
+            hidden += other
+        latent: Tensor = self.rest(hidden)
+        return latent
 
 
 def _folded_conv(image: Tensor, weight: Tensor, stride: int) -> Tensor:
@@ -270,28 +252,6 @@ def make_head(resolution: int) -> nn.Sequential:
     for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
         layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU(inplace=True)]
     return nn.Sequential(*layers[:-1])
-
-
-def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
-    """Evaluate heads of `make_head` on the same latent (B, 32, 4, 4); returns (B, 2, R, R) each.
-
-    One convolution a layer, with the weights of all heads, is faster on a CPU than several small ones: a training with
-    the paper's networks by a fifth.
-    """
-    if not isinstance(heads[0][0], nn.ConvTranspose2d):
-        return [_precise(head(latent)) for head in heads]
-    first, *rest = zip(*heads, strict=True)
-    values = F.conv_transpose2d(_channels_last(latent), *_joined(first, 1), first[0].stride, first[0].padding)
-    for layers in rest:
-        if isinstance(layers[0], nn.ELU):
-            values = layers[0](values)
-            continue
-        # Each head continues with its own channels.
-        blocks = torch.block_diag(*(layer.weight.flatten(1) for layer in layers))
-        weight = blocks.unflatten(1, (-1, *layers[0].weight.shape[2:]))
-        bias = torch.cat([layer.bias for layer in layers])
-        values = F.conv_transpose2d(values, weight, bias, layers[0].stride, layers[0].padding)
-    return [_precise(part).contiguous() for part in values.chunk(len(heads), dim=1)]
 
 
 def _precise(output: Tensor) -> Tensor:
@@ -526,7 +486,7 @@ class Actor(SquashedActor):
             latent = self.encoder(normalise_image(image_of(observation)))
         else:
             latent = self.trunk(self.encoder(observation))
-        mean, raw_std = decode([self.mean, self.std], latent)
+        mean, raw_std = (_precise(head(latent)) for head in (self.mean, self.std))
         return Outputs(mean, raw_std)
 
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
@@ -601,7 +561,7 @@ class ResidualActor(Actor):
             if size != self.resolution:
                 on_grid = compose(coarse.parts, self.resolution, self.interpolation)
             latent = self.trunk(self.encoder(observation), on_grid)
-        mean, raw_std, gate_logit = decode([self.mean, self.std, self.gate], latent)
+        mean, raw_std, gate_logit = (_precise(head(latent)) for head in (self.mean, self.std, self.gate))
         return Outputs(mean, raw_std, gate_logit, coarse)
 
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:

@@ -38,7 +38,7 @@ METRICS: dict[str, str] = {
 MOST_EMPTY_WINDOWS = 10
 #: Gradients of single actions longer than this many running medians are shortened to it.
 OUTLIER = 3.0
-#: Latest norms that the median is taken of.
+#: Latest norms that the median is taken of, or those of a window if they are more.
 HISTORY = 2_000
 #: Largest magnitude of an improved mean, whose tanh is 0.987, and of an improved gate logit before its bias.
 BOUND = 2.5
@@ -76,7 +76,8 @@ class ActionStep(Resumable):
         gradients = gradients.double()  # squares of outliers overflow in single precision
         norms = gradients.flatten(2).norm(dim=2)
         found = norms.cpu().numpy()
-        self.norms = [*self.norms, *found[found > 0].tolist()][-HISTORY:]
+        # Whole windows: norms change along them, and with many robots the latest would be of its last steps alone.
+        self.norms = [*self.norms, *found[found > 0].tolist()][-max(HISTORY, found.size) :]
         if not self.norms:
             return locations.clone()
         largest = OUTLIER * float(np.median(self.norms))

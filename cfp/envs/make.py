@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import logging
+import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -85,6 +87,18 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
         return TorchEnv(config.task, resolution=resolution, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
+
+
+@contextmanager
+def all_generators_kept() -> Iterator[None]:
+    """Restore the global generators of torch, NumPy and Python, which stable-baselines3 seeds."""
+    numbers, choices = np.random.get_state(), random.getstate()
+    try:
+        with generators_kept():
+            yield
+    finally:
+        np.random.set_state(numbers)
+        random.setstate(choices)
 
 
 @contextmanager

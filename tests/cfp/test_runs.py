@@ -2,13 +2,16 @@
 
 import importlib
 import io
+import random
 import sys
 from unittest import mock
 
 import cv2
 import gymnasium
 import matplotlib
+import numpy as np
 import pytest
+import torch
 from short_episodes import HORIZON
 from tiny_runs import TABLES, assert_same_run
 from watching import at_step, interrupt
@@ -43,8 +46,11 @@ def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finishe
         if row["step"] == 120:
             raise Pruned
 
+    before = torch.get_rng_state(), np.random.get_state(), random.getstate()
     with at_step(14, interrupt), pytest.raises(KeyboardInterrupt, match="resume=True"):
         cfp.fit("shapematch", steps=150, out=str(folder), **OPTIONS)
+    assert torch.equal(torch.get_rng_state(), before[0]) and random.getstate() == before[2]
+    np.testing.assert_array_equal(np.random.get_state()[1], before[1][1])
     capfd.readouterr()
     with pytest.raises(Pruned):
         cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=prune, **OPTIONS)
