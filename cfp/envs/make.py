@@ -92,12 +92,12 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
 @contextmanager
 def all_generators_kept() -> Iterator[None]:
     """Restore the global generators of torch, NumPy and Python, which stable-baselines3 seeds."""
-    numbers, choices = np.random.get_state(), random.getstate()
+    numbers, choices = np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
         with generators_kept():
             yield
     finally:
-        np.random.set_state(numbers)
+        np.random.set_state(numbers)  # noqa: NPY002
         random.setstate(choices)
 
 
