@@ -265,7 +265,7 @@ class EvaluationCallback(StageCallback):
         on_evaluation: OnEvaluation | None,
     ) -> None:
         super().__init__(stage, stage.config.eval_every)
-        self.on_evaluation = on_evaluation
+        self.on_evaluation, self._row = on_evaluation, dict[str, Any]()
         self.table, self.trackers, self.bar, self.signals = table, trackers, bar, signals
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
@@ -317,7 +317,12 @@ class EvaluationCallback(StageCallback):
             self.trackers.record(name, Image(picture, "HWC"))
         self.trackers.dump(stage.step)
         self.bar.show(evaluated=result.mean)
-        if self.on_evaluation is not None:
+        self._row = row
+
+    def report(self) -> None:
+        """Pass on the row of the last evaluation, once."""
+        row, self._row = self._row, {}
+        if row and self.on_evaluation is not None:
             self.on_evaluation(row)
 
     def _on_training_start(self) -> None:
@@ -349,10 +354,12 @@ class CheckpointCallback(StageCallback):
         just_evaluated = self.evaluation.evaluated == self.stage.step > self._last
         if self._is_due() or just_evaluated or self.signals.number:
             self._act()
+        self.evaluation.report()  # after the checkpoint, so that a run that this ends goes on from there
 
     def _on_training_end(self) -> None:
         if self._saved < self.stage.step:
             self._act()
+        self.evaluation.report()
 
 
 class StopCallback(StageCallback):

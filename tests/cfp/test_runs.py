@@ -43,7 +43,7 @@ def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finishe
 
     def prune(row):
         rows.append(row)
-        if row["step"] == 120:
+        if row["step"] in (60, 120):
             raise Pruned
 
     before = torch.get_rng_state(), np.random.get_state(), random.getstate()
@@ -52,8 +52,9 @@ def test_fit_is_the_command_line_and_goes_on_after_whatever_has_ended_it(finishe
     assert torch.equal(torch.get_rng_state(), before[0]) and random.getstate() == before[2]
     np.testing.assert_array_equal(np.random.get_state()[1], before[1][1])
     capfd.readouterr()
-    with pytest.raises(Pruned):
-        cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=prune, **OPTIONS)
+    for _ in range(2):  # each goes on after the evaluation that has ended the one before
+        with pytest.raises(Pruned):
+            cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=prune, **OPTIONS)
     assert [(row["step"], row["stage"]) for row in rows] == [(60, 1), (70, 1), (70, 2), (120, 2)]
     assert not (folder / "results.json").exists()
     run = cfp.fit("shapematch", out=folder, resume=True, quiet=True, on_evaluation=rows.append, **OPTIONS)
