@@ -65,7 +65,7 @@ short=(--window 40 --max-episode-steps 40 --action-step 0.05)
 for seed in 0 1; do
     torchmpm train --algo mpc --task grow --termination-steps 0 --seed $seed --out runs/grow-plan-$seed
     torchmpm train --algo distill --task grow --teacher runs/grow-plan-$seed --resolutions 8 --steps 10240 \
-        --max-episode-steps 45 --rollout-steps 32 --updates 160 --batch-size 64 --student-learning-rate 2e-3 \
+        --max-episode-steps 45 --rollout-steps 32 --updates 160 --batch-size 64 --learning-rate 2e-3 \
         --beta-decay 0.9 --dropout 0 --seed $seed --out runs/grow-distilled-$seed
     torchmpm train "${common[@]}" "${short[@]}" --start-from runs/grow-distilled-$seed --steps 6400 --seed $seed \
         --out runs/grow-40-$seed

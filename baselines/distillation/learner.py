@@ -1,4 +1,4 @@
-"""Distillation: the image networks of the coarse-to-fine policy imitate a policy or planner that sees more.
+"""Distillation: the image networks of the coarse-to-fine policy imitate a policy that sees more.
 
 By dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states.
 """
@@ -16,16 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.grid import Grid, find_grid, long_dt
-from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
-from baselines.planning.gradient import GradientPlannerConfig
-from baselines.planning.mpc import planner_preset
+from baselines.distillation.teachers import Teacher, project, read_teacher
 from baselines.registry import configure, find
 from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.critic import check_norms, descend
 from cfp.analytic.window import Episodes
 from cfp.config import TASK_OPTIONS, Particles, StagedConfig, check_training_seeds
-from cfp.envs.make import choose_device, make_env, make_torch_env, seeded
+from cfp.envs.make import choose_device, make_env, seeded
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError, check_at_least, check_fraction, check_positive
 from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import policy_path
@@ -38,7 +35,6 @@ from cfp.presets import sac_preset
 from cfp.resumable import Resumable, compress, decompress
 from dittogym import TorchEnv, make_spec
 from dittogym.conditions import drop
-from dittogym.spec import DT
 from torchmpm import tree
 
 #: Control steps after which it is drawn anew whether teacher or student acts on a robot.
@@ -50,7 +46,7 @@ TRAINED = ("shac", "gradient")
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round; empty if none did",
     "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
-    "train/fresh_loss": "the same on the labels of the round before the student learned from them, None for no labels",
+    "train/fresh_loss": "the same on the labels of the round before the student learned from them",
     "train/beta": "the probability with which the teacher acted in the round",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
@@ -61,18 +57,16 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillConfig(GradientPlannerConfig, StagedConfig):
+class DistillConfig(StagedConfig):
     """Options of a distillation, in which num_envs robots move side by side.
 
-    The environment options apply to evaluations of the student, train_particles to its training. The options of
-    planning (horizon, commit, noise, termination_steps, split_weight, iterations, learning_rate, clip, planner_grid)
-    apply to the teacher mpc, and are refused with others.
+    The environment options apply to evaluations of the student, train_particles to its training.
     """
 
     algo: str = "distill"
     """Name of the algorithm."""
     teacher: str = "shac"
-    """Teacher: mpc (plans from every state), shac or gradient (trained first), or a policy (a run folder or a file)."""
+    """Teacher: shac or gradient (trained first), or a policy (a run folder or a file)."""
     train_particles: Particles = "lite"
     """Particles of the simulations in training."""
     rollout_steps: int = 64
@@ -83,7 +77,7 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Labels in a gradient step."""
     student_noise: bool = True
     """Whether the student acts with the noise of its policy."""
-    student_learning_rate: float = 1e-3
+    learning_rate: float = 1e-3
     """Adam's step size at the beginning of each stage; it falls to a tenth."""
     max_grad_norm: float = 1.0
     """Largest norm of the gradient."""
@@ -95,13 +89,6 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     """Control steps after which training episodes end, the first ones at staggered times."""
     num_layouts: int = 64
     """Particle layouts that training episodes start from in turn; in GROW and OBSTACLE all are the same."""
-    planner_grid: Grid = "coarse"
-    """Action grid of the teacher mpc: coarse or fine (the task's), or a number."""
-
-    @property
-    def planner_resolution(self) -> int:
-        """Action grid R of the teacher mpc."""
-        return find_grid("planner_grid", self.task, self.planner_grid)
 
     @property
     def update_every(self) -> int:
@@ -111,18 +98,10 @@ class DistillConfig(GradientPlannerConfig, StagedConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_planner(self.planner_resolution)
-        if self.teacher != "mpc":
-            planner, grid = planner_preset(self.task)
-            for name, usual in {**vars(planner), "planner_grid": grid}.items():
-                if (given := getattr(self, name)) != usual:
-                    raise ConfigError(
-                        f"{name} requires teacher mpc, which alone plans, got {given} with {self.teacher}"
-                    )
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_training_seeds("num_layouts", self.num_layouts, self.num_envs, len(self.resolutions))
-        check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)
 
 
@@ -145,10 +124,9 @@ class Dataset:
         return sum(len(labels.observations) for labels in self.rounds)
 
     def add(self, labels: Labels) -> None:
-        """Add a round, if it has labels."""
-        if len(labels.observations):
-            self.rounds.append(labels)
-            self._compressed.append(None)
+        """Add a round."""
+        self.rounds.append(labels)
+        self._compressed.append(None)
 
     def sample(self, count: int) -> Labels:
         """Draw labels uniformly with replacement, from torch's generator."""
@@ -186,12 +164,11 @@ def drop_entries(values: Tensor, probability: float, grid: int | None = None) ->
 class Collector(Resumable):
     """Lets a mixture of student and teacher act, and labels the states by the teacher.
 
-    Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
-    computed from that very state, or is part of a plan which the robot has followed from its beginning.
+    Who controls a robot is drawn anew every ``switch_every`` steps.
     """
 
     parts = ("episodes", "teacher")
-    values = ("steps_since_switch", "teacher_acts", "restarted")
+    values = ("steps_since_switch", "teacher_acts")
 
     def __init__(
         self, teacher: Teacher, episodes: Episodes, switch_every: int, dropout: float = 0.0, grid: int | None = None
@@ -200,7 +177,6 @@ class Collector(Resumable):
         self.dropout, self.grid = dropout, grid
         self.steps_since_switch = switch_every
         self.teacher_acts = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
-        self.restarted = self.teacher_acts.clone()  # a new episode began since the teacher's plan was made
 
     @torch.no_grad()
     def collect(
@@ -220,19 +196,16 @@ class Collector(Resumable):
         observation = env.observation()
         for _ in range(steps):
             teacher_action = self.teacher.act(env, observation)
-            if self.teacher.fresh:
-                self.restarted = torch.zeros_like(self.restarted)
-                if self.steps_since_switch >= self.switch_every:
-                    draws = torch.rand(env.num_envs).to(env.device)
-                    self.teacher_acts, self.steps_since_switch = draws < beta, 0
+            if self.steps_since_switch >= self.switch_every:
+                draws = torch.rand(env.num_envs).to(env.device)
+                self.teacher_acts, self.steps_since_switch = draws < beta, 0
             self.steps_since_switch += 1
-            follows = self.teacher_acts & ~self.restarted
-            valid = ~self.restarted if self.teacher.fresh else follows
-            images.append(observation[valid].cpu())
-            actions.append(teacher_action[valid].cpu())
+            images.append(observation.cpu())
+            actions.append(teacher_action.cpu())
             student_action = student(drop_entries(observation, self.dropout))
             student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
-            observation, done, infos = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
+            teacher_action = self._enlarge(teacher_action)
+            observation, done, infos = self._step(tree.where(self.teacher_acts, teacher_action, student_action))
             if not after_step(done, infos):
                 return None
         return Labels(torch.cat(images), torch.cat(actions))
@@ -247,7 +220,6 @@ class Collector(Resumable):
         infos, done = self.episodes.infos(outcome), outcome.values["done"]
         if done.any():
             self.episodes.restart(outcome)
-            self.restarted = self.restarted | outcome.done
             observation = self.env.observation()
         return observation, done, infos
 
@@ -293,7 +265,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             self.actor = build_actor(self.spec)
         self.actor.fix_std()
         self.actor.to(self.device)
-        self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
+        self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.learning_rate)
         self.policy = NetworksPolicy(self.observation_space, self.action_space, actor=self.actor)
         if self.env is not None:  # a loaded model can act without one
             self.begin_episodes()
@@ -303,20 +275,11 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         config = self.config
         seed = config.seed + (self.stage - 1) * config.num_layouts
         episodes = Episodes(self.simulation, seed, config.max_episode_steps, config.num_layouts)
-        teacher, grid = self._make_teacher(), self.spec.resolutions[-1]
+        policy = read_teacher(self.teacher_file or config.teacher, config.task, config.environment)
+        teacher, grid = Teacher(policy, config.action_layout), self.spec.resolutions[-1]
         self.collector = Collector(teacher, episodes, SWITCH_EVERY, config.dropout, grid)
         self.dataset, self.rounds = Dataset(), 0
         self._last_obs = self.simulation.observation().cpu().numpy()
-
-    def _make_teacher(self) -> Teacher:
-        config = self.config
-        if self.teacher_file is None and config.teacher == "mpc":
-            as_usual = config.substeps is None and config.dt == DT  # others were chosen by the user
-            cheap = config.for_training().simulated_with(dt=long_dt(config.task) if as_usual else None)
-            model = make_torch_env(cheap, config.planner_resolution)
-            return PlannerTeacher(model, config, config.seed)
-        policy = read_teacher(self.teacher_file or config.teacher, config.task, config.environment)
-        return PolicyTeacher(policy, config.action_layout)
 
     def _seeded(self) -> AbstractContextManager[None]:
         """Seed torch's generators by run, stage and step, and restore them afterwards."""
@@ -331,7 +294,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         """
         config, beta = self.config, self.config.beta_decay**self.rounds
         progress = self.progress
-        learning_rate = config.student_learning_rate * linear_decay(progress)
+        learning_rate = config.learning_rate * linear_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate
         with self._seeded():
             collected = self.collector.collect(config.rollout_steps, beta, self._student, self.after_step)
@@ -365,10 +328,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         return labels._replace(actions=project(labels.actions, size, self.simulation.spec.patch))
 
     @torch.no_grad()
-    def _fresh_loss(self, labels: Labels) -> float | None:
-        """Loss on about a batch of new labels; None in a round within a plan that no robot followed."""
-        if len(labels.actions) == 0:
-            return None
+    def _fresh_loss(self, labels: Labels) -> float:
+        """Loss on about a batch of new labels."""
         part = slice(0, None, max(1, len(labels.actions) // self.config.batch_size))
         return float(self.loss(labels.observations[part], labels.actions[part]))
 
@@ -419,9 +380,8 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         """
         base, shape_match = sac_preset(task, name), task == "shapematch"
         steps = 24_000 if shape_match else 48_000
-        planner, grid = planner_preset(task)
         config = DistillConfig(
-            **(vars(planner) | vars(base.environment) | {"num_envs": 16}),
+            **(vars(base.environment) | {"num_envs": 16}),
             task=task,
             preset=base.preset,
             eval_every=steps // 8,
@@ -438,7 +398,6 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             gate_scale=base.gate_scale,
             student_noise=not base.eval_deterministic,
             dropout=0.2,
-            planner_grid=grid,
         )
         if not shape_match:
             return config
@@ -448,7 +407,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
             rollout_steps=30,
             updates=160,
             batch_size=64,
-            student_learning_rate=2e-3,
+            learning_rate=2e-3,
             beta_decay=0.8,
         )
 
@@ -456,7 +415,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     def begin(cls, config: DistillConfig, folder: Path) -> tuple[int, int]:
         """Copy the teacher into the folder, if it is a policy; else remove what an earlier attempt has left there."""
         teacher = config.teacher
-        if teacher in ("mpc", *TRAINED):
+        if teacher in TRAINED:
             teacher_path(folder).unlink(missing_ok=True)
             return 1, 0
         try:
@@ -464,7 +423,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         except CheckpointError as error:
             if Path(teacher).exists() or is_address(teacher):
                 raise
-            names = ", ".join(("mpc", *TRAINED, *shipped()))
+            names = ", ".join((*TRAINED, *shipped()))
             raise ConfigError(
                 f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}"
             ) from error
@@ -491,7 +450,7 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
         env = make_env(config.for_training(), make_spec(config.task).patch)
         device = choose_device(config.device)
         learner = cls("NetworksPolicy", env, config, stage, device, _init_setup_model=False)
-        learner.teacher_file = None if config.teacher == "mpc" else teacher_path(folder)
+        learner.teacher_file = teacher_path(folder)
         learner._setup_model()
         if stage > 1:
             copy_coarse_weights(learner.actor, load(policy_path(folder, stage - 1), device).actor)
@@ -501,11 +460,11 @@ class Distill(Resumable, UpdateLoop, CoarseToFine):
     @classmethod
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
         """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
-        if config.teacher in ("mpc", *TRAINED) or "layout" not in read_policy(teacher_path(folder))[1]:
+        if config.teacher in TRAINED or "layout" not in read_policy(teacher_path(folder))[1]:
             return []
         if config.make_spec().starts_alike:
             return []
         return [
             f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
-            "evaluate it from other starts (torchmpm evaluate --policy), or use mpc, which plans anew"
+            "evaluate it from other starts (torchmpm evaluate --policy)"
         ]

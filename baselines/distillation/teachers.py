@@ -1,7 +1,6 @@
-"""Teachers of a distillation: a trained policy of any kind, or the gradient planner."""
+"""Teachers of a distillation: trained policies of any kind."""
 
 import functools
-from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
-from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
 from cfp.config import EnvironmentConfig
 from cfp.policy import Policy, check_trained_for, read_policy
@@ -20,20 +18,11 @@ from dittogym.action import ActionLayout, bicubic_matrix, from_grid_layout, to_g
 from dittogym.render.recording import attached
 
 
-class Teacher(Resumable, ABC):
-    """Labels the present states of an environment with actions."""
+class Teacher(Resumable):
+    """Labels the states of an environment with the actions of a policy, without noise.
 
-    fresh: bool = True
-    """Whether the last actions were computed from the present states. If not, they continue a plan, and are labels only
-    for robots that have followed it."""
-
-    @abstractmethod
-    def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
-        """Actions (B, 2, R, R) for the present states, whose images are (B, 3, 64, 64)."""
-
-
-class PolicyTeacher(Teacher):
-    """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
+    An open-loop policy plays the action of the step that each episode is at.
+    """
 
     def __init__(self, policy: Policy, action_layout: ActionLayout) -> None:
         self.policy, self.action_layout = policy, action_layout
@@ -41,7 +30,7 @@ class PolicyTeacher(Teacher):
 
     @torch.no_grad()
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
-        """Mean actions (B, 2, R, R) of the policy."""
+        """Mean actions (B, 2, R, R) for the present states, whose images are (B, 3, 64, 64)."""
         policy = attached(self.policy, env)
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
@@ -56,23 +45,6 @@ class PolicyTeacher(Teacher):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self._memory = tuple(array.numpy() for array in state["memory"]) or None
-
-
-class PlannerTeacher(Teacher):
-    """The gradient planner, which plans for all robots at once from the states that the student has reached."""
-
-    parts = ("planner",)
-
-    def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
-        env.reset(seed=seed)
-        self.env = env
-        self.planner = GradientPlanner(env, config, seed=seed)
-
-    def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
-        """The next actions (B, 2, R, R) of the plans."""
-        self.env.env_state = env.env_state
-        self.fresh = self.planner.needs_plan
-        return self.planner.act().float()
 
 
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:

@@ -11,7 +11,7 @@ import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, Shac, train
 from baselines.distillation.learner import METRICS, Collector, Dataset, Labels, drop_entries
-from baselines.distillation.teachers import PolicyTeacher, Teacher, project
+from baselines.distillation.teachers import Teacher, project
 from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.segments import Nodes
 from baselines.registry import configure
@@ -20,6 +20,7 @@ from cfp.envs.make import make_env
 from cfp.errors import NonFiniteError
 from cfp.learner import copy_coarse_weights
 from cfp.policy import describe_run, read_policy, write_policy
+from cfp.resumable import Resumable
 from cfp.tables import read_table
 from dittogym import TorchEnv
 from dittogym.action import patch_field, to_grid_layout
@@ -29,18 +30,28 @@ pytestmark = pytest.mark.usefixtures("short")  # SHAPE MATCH only
 
 def options(**changes):
     defaults = {"num_envs": 2, "particles": 300, "substeps": 4, "train_particles": 300, "device": "cpu"}
-    defaults |= {"teacher": "mpc", "horizon": 2, "commit": 2, "iterations": 1, "planner_grid": 4}
     defaults |= {"resolutions": (8, 16), "encoder": "small", "rollout_steps": 4, "updates": 2, "batch_size": 8}
     return replace(Distill.preset("run", "quick"), **defaults | changes)
 
 
-def make(stage=1, **changes):
-    config = options(**changes)
-    return Distill("NetworksPolicy", make_env(config.for_training(), 64), config, stage, "cpu")
+@pytest.fixture
+def make(tmp_path):
+    """Makes a student; unless one is given, its teacher is a sequence of actions."""
+
+    def make(stage=1, **changes):
+        config = options(**changes)
+        if "teacher" not in changes:
+            path = tmp_path / "sequence.safetensors"
+            actions = 2.0 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 1.0
+            write_policy(path, {"actions": actions}, describe_run(config, "gradient", 1, 0) | {"layout": 0})
+            config = replace(config, teacher=str(path))
+        return Distill("NetworksPolicy", make_env(config.for_training(), 64), config, stage, "cpu")
+
+    return make
 
 
-class Mirror(Teacher):
-    """Pulls where the image shows matter, by image alone: what a student can copy."""
+class Mirror(Resumable):
+    """A teacher that pulls where the image shows matter, by image alone: what a student can copy."""
 
     def act(self, env, observation):
         """Actions between -0.4 and 0.4."""
@@ -61,7 +72,7 @@ def segments(tmp_path_factory):
     return path
 
 
-def test_how_a_policy_is_evaluated_does_not_change_what_it_learns():
+def test_how_a_policy_is_evaluated_does_not_change_what_it_learns(make):
     def learned(quiet, **changes):
         student = make(beta_decay=0.0, eval_deterministic=quiet, **changes)
         learn(student, 16)  # the student leads in the second round
@@ -81,7 +92,7 @@ def test_actions_are_lost_on_the_grid_on_which_the_student_decides():
     assert (cells == cells[..., :1]).all() and 0.1 < (cells == 0).float().mean() < 0.4
 
 
-def test_student_meets_faults_and_labels_do_not():
+def test_student_meets_faults_and_labels_do_not(make):
     rounds = {}
     for share in (0.0, 0.9):
         student, looks = make(substeps=5, dropout=share), []
@@ -100,7 +111,7 @@ def test_student_meets_faults_and_labels_do_not():
     assert torch.equal(faulty.actions, Mirror().act(student.simulation, faulty.observations))
 
 
-def test_student_learns_from_images_as_its_policy_will_see_them():
+def test_student_learns_from_images_as_its_policy_will_see_them(make):
     """With missing pixels filled."""
     student = make(particles=2000)
     seen = drop_entries(student.simulation.observation(), 0.5)
@@ -110,7 +121,7 @@ def test_student_learns_from_images_as_its_policy_will_see_them():
     assert student.spec.fill_missing and not torch.equal(student.spec.filled(seen), seen)
 
 
-def test_algorithm_acts_by_the_student_on_the_grid_of_its_environment():
+def test_algorithm_acts_by_the_student_on_the_grid_of_its_environment(make):
     student = make()
     images = student.simulation.observation().numpy()
     action, size = student.predict(images, deterministic=True)[0], student.spec.action_size
@@ -119,7 +130,7 @@ def test_algorithm_acts_by_the_student_on_the_grid_of_its_environment():
     assert torch.equal(torch.from_numpy(action), project(wanted, 64, student.simulation.spec.patch))
 
 
-def test_student_does_as_the_teacher_in_a_closed_loop():
+def test_student_does_as_the_teacher_in_a_closed_loop(make):
     own = {"num_envs": 4, "substeps": 20, "rollout_steps": 16, "updates": 20, "batch_size": 16}
     own |= {"steps": 384, "handover": (2 / 3,)}
     student, fine = make(**own), make(2, **own)
@@ -142,8 +153,8 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
             images = env.step(torch.as_tensor(action))[0]
 
 
-def test_resumed_with_a_teacher_that_remembers_it_is_the_same_to_the_last_bit(segments):
-    """A policy of segments, and episodes that end; `test_programs` resumes with a planner."""
+def test_resumed_with_a_teacher_that_remembers_it_is_the_same_to_the_last_bit(make, segments):
+    """A policy of segments, and episodes that end; `test_programs` resumes with a sequence of actions."""
     whole, first, second = (make(teacher=str(segments), max_episode_steps=6) for _ in range(3))
     learn(whole, 32)
     learn(first, 16)
@@ -157,31 +168,10 @@ def test_resumed_with_a_teacher_that_remembers_it_is_the_same_to_the_last_bit(se
         assert torch.equal(mine.observations, theirs.observations) and torch.equal(mine.actions, theirs.actions)
 
 
-class Scripted(Teacher):
-    """Looks only every third step; answers the number of the call."""
-
-    calls = -1
-
-    def act(self, env, observation):
-        """A constant action."""
-        self.calls += 1
-        self.fresh = self.calls % 3 == 0
-        return torch.full((env.num_envs, 2, 4, 4), self.calls / 10)
-
-
-# Robot 0 is cut after calls 0, 2 and 4, robot 1 after 1, 3 and 5; each then waits for the next look.
-@pytest.mark.parametrize(("share", "expected"), [(1.0, [0, 0, 1, 3, 3, 4]), (0.0, [0, 0, 3, 3])])
-def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
-    env = TorchEnv("run", 2, 64, particles=100, substeps=1)
-    collector = Collector(Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
-    labels = collector.collect(6, share, lambda images: torch.zeros(2, 2, 8, 8), go_on)
-    assert sorted((10 * labels.actions[:, 0, 0, 0]).round().int().tolist()) == expected
-
-
 def test_labels_of_all_rounds_are_drawn_with_their_images():
     torch.manual_seed(0)
     dataset = Dataset()
-    for numbers in (torch.arange(4), torch.arange(0), torch.arange(4, 8)):  # the second round has none
+    for numbers in (torch.arange(4), torch.arange(4, 8)):
         column = numbers[:, None, None, None]
         dataset.add(Labels(column.expand(-1, 3, 64, 64).byte(), column.expand(-1, 2, 8, 8).float()))
     images, actions = dataset.sample(200)
@@ -189,22 +179,7 @@ def test_labels_of_all_rounds_are_drawn_with_their_images():
     assert len(dataset) == len(drawn.unique()) == 8 and torch.equal(images[:, 0, 0, 0].float(), drawn)
 
 
-def test_round_without_labels_has_no_fresh_loss():
-    student = make()
-    (first,) = learn(student, 8)
-
-    def nobody_follows(steps, beta, act, after_step):
-        for _ in range(steps):
-            after_step(torch.zeros(2, dtype=torch.bool), [{}, {}])
-        return Labels(torch.zeros(0, 3, 64, 64, dtype=torch.uint8), torch.zeros(0, 2, 8, 8))
-
-    student.collector.collect = nobody_follows
-    (second,) = learn(student, 8)
-    assert first["train/fresh_loss"] > 0 and second["train/fresh_loss"] is None
-    assert second["train/labels"] == first["train/labels"] and second["train/loss"] > 0
-
-
-def test_loss_that_is_not_finite_ends_the_training():
+def test_loss_that_is_not_finite_ends_the_training(make):
     student = make()
     with torch.no_grad():
         next(student.actor.parameters()).fill_(float("nan"))
@@ -234,9 +209,9 @@ def test_sequence_teaches_by_the_step_of_the_episode_in_its_own_orientation():
     env = TorchEnv("run", 3, particles=100, substeps=1)
     images, _ = env.reset(seed=0)
     env.env_state = replace(env.env_state, steps=torch.tensor([0, 4, 20]))
-    action = PolicyTeacher(record, "image").act(env, images)
+    action = Teacher(record, "image").act(env, images)
     assert torch.equal(action, torch.stack((record.actions[0], record.actions[4], torch.zeros(2, 8, 8))))
-    assert torch.equal(PolicyTeacher(record, "grid").act(env, images), to_grid_layout(action, "image"))
+    assert torch.equal(Teacher(record, "grid").act(env, images), to_grid_layout(action, "image"))
 
 
 TINY = (

@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from test_programs import COMMON, TINY, run
+from test_programs import options_of, run
 
 import baselines
 from cfp.experiment.checkpoint import Checkpoint
@@ -23,8 +23,8 @@ SPAN = 3.0
 def test_killed_training_ends_like_one_that_was_left_alone(algo, tmp_path):
     alone, folder = tmp_path / "alone", tmp_path / "killed"
     assert run(algo, alone, *STEPS[algo].split()) == 0
-    options = [*COMMON, "--task", "shapematch", "--algo", algo, *TINY[algo][0].split(), *STEPS[algo].split()]
-    command = [sys.executable, "-u", "-m", "baselines.train", *options, "--out", str(folder), "--resume"]
+    options = [*options_of(algo, folder), "--task", "shapematch", *STEPS[algo].split()]
+    command = [sys.executable, "-u", "-m", "baselines.train", *options, "--resume"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # as here; other numbers of threads give other last digits
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     chance, codes, rows = random.Random(0), [], read_table(alone / "evaluations.csv")

@@ -53,9 +53,8 @@ TINY = {
     "transformer-16": (REWARDS, 34, ["stage 1"]),
     "transformer-64": (REWARDS, 34, ["stage 1"]),
     "distill": (
-        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
-        "--resolutions 4 8 --steps 40 --handover 0.5 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
-        "--checkpoint-every 10 --log-every 10",
+        "--num-envs 2 --train-particles 100 --resolutions 4 8 --steps 40 --handover 0.5 --rollout-steps 5 --updates 2 "
+        "--batch-size 4 --eval-every 20 --checkpoint-every 10 --log-every 10",
         34,
         ["stage 1", "stage 2"],
     ),
@@ -77,8 +76,23 @@ ALIKE = {"coarse", "cem"}
 LEVELS = ("cfp-analytic", "cfp-sac", "coarse", "distill", "fine")
 
 
+def options_of(algo, folder):
+    """Command-line options of a tiny run in a folder, beside which a distillation finds its teacher."""
+    options = [*COMMON, "--algo", algo, *TINY[algo][0].split(), "--out", str(folder)]
+    return [*options, "--teacher", str(save_teacher(folder.parent))] if algo == "distill" else options
+
+
+def save_teacher(folder):
+    """Write a sequence of actions for the tiny robot; returns its file."""
+    path = folder / "teacher.safetensors"
+    config = configure({"algo": "gradient", "task": "shapematch", "particles": 100, "substeps": 1})
+    actions = 2.0 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 1.0
+    OpenLoop(actions, describe_run(config, "gradient", 1, 0) | {"layout": 0}).save(path)
+    return path
+
+
 def run(algo, folder, *more):
-    return train.main([*COMMON, "--algo", algo, *TINY[algo][0].split(), "--out", str(folder), *more])
+    return train.main([*options_of(algo, folder), *more])
 
 
 def test_every_algorithm_is_tried_here():
@@ -214,18 +228,21 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path):
 
 SHAC = {"train_particles": 100, "num_envs": 2, "window": 4, "critic_updates": 1, "grid": 8}
 SAC = {"num_envs": 2, "batch_size": 4, "buffer_size": 60, "update_start": 8}
-TEACHING = {"teacher": "mpc", "planner_grid": 4, "horizon": 2, "commit": 2, "iterations": 1, "rollout_steps": 4}
 CONFORMS = {
     "shac": SHAC,
     "coarse": SAC | {"resolutions": [8], "random_steps": [4]},
     "gnn-16": SAC | {"random_steps": 4},
-    "distill": TEACHING | {"num_envs": 2, "train_particles": 100, "resolutions": [8], "updates": 1, "batch_size": 4},
+    "distill": {
+        **{"num_envs": 2, "train_particles": 100, "resolutions": [8]},
+        **{"rollout_steps": 4, "updates": 1, "batch_size": 4},
+    },
 }
 
 
 @pytest.mark.parametrize("name", CONFORMS)
 def test_algorithm_is_one_of_stable_baselines3(name, tmp_path):
-    config = configure({"algo": name, "particles": 100, "substeps": 1, "device": "cpu", **CONFORMS[name]})
+    own = CONFORMS[name] | ({"teacher": str(save_teacher(tmp_path))} if name == "distill" else {})
+    config = configure({"algo": name, "particles": 100, "substeps": 1, "device": "cpu", **own})
     model = find(name).create(config, 1, tmp_path)
     calls = []
     model.learn(100, lambda *_: calls.append("of all robots") or len(calls) < 5)
