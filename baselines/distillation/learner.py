@@ -205,23 +205,15 @@ class Collector(Resumable):
             student_action = student(drop_entries(observation, self.dropout))
             student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
             teacher_action = self._enlarge(teacher_action)
-            observation, done, infos = self._step(tree.where(self.teacher_acts, teacher_action, student_action))
-            if not after_step(done, infos):
+            _, reward, terminated, _, info = env.step(tree.where(self.teacher_acts, teacher_action, student_action))
+            outcome = self.episodes.end_step(reward, terminated, info["finite"])
+            observation = env.observation()
+            if not after_step(outcome.values["done"], outcome.infos):
                 return None
         return Labels(torch.cat(images), torch.cat(actions))
 
     def _enlarge(self, action: Tensor) -> Tensor:
         return project(action, self.env.action_resolution, self.env.spec.patch)
-
-    def _step(self, action: Tensor) -> tuple[Tensor, np.ndarray, list[dict[str, Any]]]:
-        """Carry out an action, start new episodes where they are over; the next observation, which, and their infos."""
-        observation, reward, terminated, _, info = self.env.step(action)
-        outcome = self.episodes.read(self.episodes.record(reward, terminated), terminated, info["finite"])
-        infos, done = self.episodes.infos(outcome), outcome.values["done"]
-        if done.any():
-            self.episodes.restart(outcome)
-            observation = self.env.observation()
-        return observation, done, infos
 
 
 def teacher_path(folder: Path) -> Path:

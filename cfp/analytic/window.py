@@ -155,7 +155,8 @@ class Outcome(NamedTuple):
     """Which episodes of a batch are over after a step, and what else the host has to know of the step."""
 
     done: Tensor  # (B,) bool
-    values: dict[str, np.ndarray]  # by name: the same, and what `Episodes.read` was given; copied in one piece
+    values: dict[str, np.ndarray]  # by name: the same, and what `Episodes.end_step` was given; copied in one piece
+    infos: list[dict[str, Any]]  # return and length of each episode that is over, as stable-baselines3's Monitor has it
 
 
 class Episodes(Resumable):
@@ -181,27 +182,23 @@ class Episodes(Resumable):
         self.num_started = count
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
 
-    def record(self, reward: Tensor, terminated: Tensor) -> Tensor:
-        """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool."""
+    def end_step(self, reward: Tensor, terminated: Tensor, finite: Tensor, **others: Tensor) -> Outcome:
+        """Add the rewards (B,) of a step to the returns, and start new episodes where they are over, on other layouts.
+
+        Args:
+            reward: Of the step, (B,).
+            terminated: Which episodes the step has ended, (B,) bool.
+            finite: Which simulations can go on, (B,) bool.
+            others: What else the host is to read of the step.
+        """
         self.returns = self.returns + reward  # not in place: a saved state may hold it
-        return terminated | (self.env.env_state.steps >= self.limit)
-
-    def read(self, done: Tensor, terminated: Tensor, finite: Tensor, **others: Tensor) -> Outcome:
-        """What happened in the step that `record` was told of, with ``others`` by name, on the host."""
-        own = {"done": done, "terminated": terminated, "finite": finite, "return": self.returns}
-        return Outcome(done, to_host(own | {"length": self.env.env_state.steps} | others))
-
-    def infos(self, outcome: Outcome) -> list[dict[str, Any]]:
-        """Return and length of each episode that is over, as stable-baselines3's ``Monitor`` reports them."""
-        values, infos = outcome.values, [dict[str, Any]() for _ in range(self.env.num_envs)]
+        length = self.env.env_state.steps
+        done = terminated | (length >= self.limit)
+        own = {"done": done, "terminated": terminated, "finite": finite, "return": self.returns, "length": length}
+        values = to_host(own | others)
+        infos, seeds = [dict[str, Any]() for _ in range(self.env.num_envs)], [0] * self.env.num_envs
         for i in np.flatnonzero(values["done"]).tolist():
             infos[i]["episode"] = {"r": float(values["return"][i]), "l": int(values["length"][i])}
-        return infos
-
-    def restart(self, outcome: Outcome) -> None:
-        """Start new episodes where they are over, each on the next layout; count how they ended."""
-        values, seeds = outcome.values, [0] * self.env.num_envs
-        for i in np.flatnonzero(values["done"]).tolist():
             self.counts["episodes"] += 1
             self.counts["terminated"] += int(values["terminated"][i])
             self.counts["nonfinite"] += int(not values["finite"][i])
@@ -210,8 +207,9 @@ class Episodes(Resumable):
             self.num_started += 1
         if values["done"].any():
             self.env.reset(seed=seeds, options={"reset_mask": values["done"]})
-        self.returns = torch.where(outcome.done, 0.0, self.returns)
-        self.limit = torch.where(outcome.done, self.max_steps, self.limit)
+        self.returns = torch.where(done, 0.0, self.returns)
+        self.limit = torch.where(done, self.max_steps, self.limit)
+        return Outcome(done, values, infos)
 
     def scalars(self) -> dict[str, float | None]:
         """Counts, and the mean of `recent_returns`."""
@@ -287,25 +285,22 @@ class WindowCollector(Resumable):
             final_value = torch.where(success, self.success_reward / discount_rate(self.config.gamma), 0.0)
             next_value = torch.where(terminated, final_value, value(next_observation))
             true_rewards = info["true_reward"].detach()
-            is_over = self.episodes.record(true_rewards, terminated)
-            steps.append((observation.detach(), reward, next_value, is_over))
             if not self._is_measured and torch.is_grad_enabled():
                 check_gradient_memory(env, self.config.window, torch.cuda.memory_allocated(env.device) - memory)
                 self._is_measured = True
             further = {"true_reward": true_rewards.mean(), "acts": action.detach().isfinite().all()}
-            outcome = self.episodes.read(is_over, terminated, info["finite"], **further)
+            outcome = self.episodes.end_step(true_rewards, terminated, info["finite"], **further)
+            steps.append((observation.detach(), reward, next_value, outcome.done))
             if not outcome.values["acts"]:
                 raise NonFiniteError(DIVERGED)
             if not np.isfinite(outcome.values["true_reward"]):
                 raise reward_error(info["reward_terms"])
             true_reward += float(outcome.values["true_reward"])
-            infos = self.episodes.infos(outcome)
             if outcome.values["done"].any():
-                self.episodes.restart(outcome)
-                neighbours = tree.where(is_over, Neighbours.find(self._robot_positions()), neighbours)
-                next_observation = tree.where(is_over, self.observe(), next_observation)
+                neighbours = tree.where(outcome.done, Neighbours.find(self._robot_positions()), neighbours)
+                next_observation = tree.where(outcome.done, self.observe(), next_observation)
             observation = next_observation
-            if not after_step(outcome.values["done"], infos):
+            if not after_step(outcome.values["done"], outcome.infos):
                 env.detach()
                 return None
         observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))

@@ -117,7 +117,8 @@ def test_returns_in_double_precision_are_restored_to_the_last_bit():
         return Episodes(env, 0, max_episode_steps=9, num_layouts=2)
 
     episodes, restored = begin(), begin()
-    episodes.record(torch.tensor([0.1, 0.2], dtype=torch.float64), torch.zeros(2, dtype=torch.bool))
+    never = torch.zeros(2, dtype=torch.bool)
+    episodes.end_step(torch.tensor([0.1, 0.2], dtype=torch.float64), never, ~never)
     restored.load_state_dict(episodes.state_dict())
     assert restored.returns.tolist() == [0.1, 0.2]
 

@@ -86,7 +86,7 @@ def test_learning_by_gradients_draws_conditions_for_each_episode():
         episodes = Episodes(env, 0, 1, num_layouts=1)
         for _ in range(3):
             _, reward, terminated, _, info = env.step(torch.zeros(2, 2, 8, 8))
-            episodes.restart(episodes.read(episodes.record(reward, terminated), terminated, info["finite"]))
+            episodes.end_step(reward, terminated, info["finite"])
         return found
 
     assert set(seeds(None)) == {2}
