@@ -289,6 +289,7 @@ def like_start(base: Config, values: dict[str, Any]) -> Config:
     A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next
     grid is the paper's. An update takes several times as long, so there are fewer, of smaller batches. Strong
     exploration noise would disturb a policy that can do something already. What else differs was not measured for them.
+    Their actions on the whole patch take as much memory as two images.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base
@@ -300,7 +301,8 @@ def like_start(base: Config, values: dict[str, Any]) -> Config:
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average")}
         base = replace(base, gradient_steps=4, batch_size=64, noise_cells=0, max_episode_steps=None, **usual)
         if len(base.resolutions) > 1:
-            base = replace(base, resolutions=_published(base.task)["resolutions"])
+            grids = _published(base.task)["resolutions"]
+            base = replace(base, resolutions=grids, buffer_size=base.buffer_size // 2)
     if values.get("refine") and len(spec.resolutions) == len(base.resolutions):
         base = replace(base, resolutions=spec.resolutions)
         return replace(base, gate_bias=spec.gate_bias) if spec.gate_bias else base

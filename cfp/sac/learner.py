@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from cfp.agent.actor import Actor, NetworkInput, upsample
+from cfp.agent.actor import Actor, NetworkInput, compose, upsample
 from cfp.agent.pixels import fill_missing
 from cfp.config import Hyperparameters, Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
@@ -39,7 +39,7 @@ from cfp.learner import CoarseToFine, Learner, follow, refines
 from cfp.presets import sac_preset
 from cfp.resumable import generator_state, restore_generator
 from cfp.sac.policies import CFPPolicy, TwinCritic, TwinCriticPolicy
-from cfp.sac.replay import Composition, ReplayRing
+from cfp.sac.replay import ReplayRing
 from dittogym.copies import to_device
 
 #: Every scalar that it logs, and what it means.
@@ -260,8 +260,9 @@ class CFP(SAC):
             raise TypeError(f"n_steps must be one of the hyperparameters, got {sac_options['n_steps']} beside them")
         self.hyperparameters = own = hyperparameters
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
-        composition = Composition.of(spec) if spec else None
-        replay = {"seed": sac_options.get("seed"), "composition": composition, "n_steps": own.n_steps}
+        # As critics take them, if those are smaller than the ones that are carried out.
+        size = spec.critic_size if spec and spec.critic_size < spec.action_size else None
+        replay = {"seed": sac_options.get("seed"), "action_size": size, "n_steps": own.n_steps}
         rate = own.learning_rate
         super().__init__(
             policy,
@@ -422,16 +423,16 @@ class CFP(SAC):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Actions to execute, and their form in the replay buffer."""
         assert isinstance(self.replay_buffer, ReplayRing)
-        composition = self.replay_buffer.composition
+        size = self.replay_buffer.action_size
         random_steps = self.hyperparameters.random_steps
         if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.
-            return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
+            return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), size)
         if self.on_device:  # the environment checks the actions
-            return self._act(composition)
+            return self._act(size)
         # `predict` would fill the images of `_last_obs`, which are filled, once more.
-        if composition is not None or self.noise is not None or self._fills_images:
-            actions, stored = (part.cpu().numpy() for part in self._act(composition))
+        if size is not None or self.noise is not None or self._fills_images:
+            actions, stored = (part.cpu().numpy() for part in self._act(size))
         else:
             actions, stored = super()._sample_action(0, action_noise, n_envs)
         finite = np.isfinite(actions).reshape(len(actions), -1).all(axis=1)
@@ -443,7 +444,7 @@ class CFP(SAC):
         return actions, stored
 
     def _on_action_grid(
-        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
+        self, actions: np.ndarray, stored: np.ndarray, stored_size: int | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Coarsen uniform actions to the action grid of the stage; independent pixels of a patch would average out."""
         if not isinstance(self.policy, CFPPolicy):
@@ -452,12 +453,14 @@ class CFP(SAC):
         if grid == size:
             return actions, stored
         corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
-        actions = upsample(corner, size, self.policy.spec.interpolation).numpy()
-        return actions, actions if composition is None else composition.from_finest(corner).numpy()
+        actions, stored = (
+            upsample(corner, each, self.policy.spec.interpolation).numpy() for each in (size, stored_size or size)
+        )
+        return actions, stored
 
     @torch.no_grad()
-    def _act(self, composition: Composition | None) -> tuple[Any, Any]:
-        """Act as ``predict`` does, with exploration noise, and keep the parts of the actions; returns tensors."""
+    def _act(self, stored_size: int | None) -> tuple[Any, Any]:
+        """Act as ``predict`` does, with exploration noise; actions, and those to store of another size, as tensors."""
         assert self._last_obs is not None
         self.policy.set_training_mode(False)
         seen: Any = self._last_obs
@@ -468,7 +471,9 @@ class CFP(SAC):
             noise = to_device(self.noise().numpy(), outputs.mean.device)
             outputs = outputs._replace(mean=outputs.mean + noise)
         sample = actor.act(outputs)
-        return sample.action, sample.action if composition is None else composition.join(sample.parts)
+        if stored_size is None or not isinstance(self.policy, CFPPolicy):
+            return sample.action, sample.action
+        return sample.action, compose(sample.parts, stored_size, self.policy.spec.interpolation)
 
     @property
     def _fills_images(self) -> bool:

@@ -1,9 +1,7 @@
-"""The replay buffer, in main memory or on a GPU, and the compact form in which it keeps composed actions."""
+"""The replay buffer, in main memory or on a GPU."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
-from cfp.agent.actor import ActorSpec, Interpolation, compose
 from cfp.errors import ConfigError
 from dittogym.copies import to_device
 
@@ -24,61 +21,15 @@ FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "t
 ROOM = 0.7
 
 
-@dataclass(frozen=True)
-class Composition:
-    """Structure of a vector that holds the parts of a composed action, see `cfp.agent.actor.compose`."""
-
-    resolutions: tuple[int, ...]  # Action grid R of each stage, coarsest first
-    size: int  # Rows and columns of the composed action as critics take it
-    interpolation: Interpolation
-
-    @classmethod
-    def of(cls, spec: ActorSpec) -> Composition | None:
-        """Composition of an actor; None if critics take the executed action, and it is no larger than its parts."""
-        if spec.patch is None:
-            return None
-        composition = cls(spec.resolutions, spec.critic_size, spec.interpolation)
-        smaller = composition.length < 2 * spec.action_size**2
-        return composition if smaller or spec.critic_size < spec.action_size else None
-
-    @property
-    def grids(self) -> tuple[int, ...]:
-        """Action grid R of each part."""
-        return (self.resolutions[0], *(grid for grid in self.resolutions[1:] for _ in range(2)))
-
-    @property
-    def length(self) -> int:
-        """Number of entries of a vector."""
-        return sum(2 * grid**2 for grid in self.grids)
-
-    def join(self, parts: Sequence[Tensor]) -> Tensor:
-        """Concatenate parts (B, 2, R, R) to vectors (B, length)."""
-        return torch.cat([part.flatten(1) for part in parts], dim=1)
-
-    def split(self, vectors: Tensor) -> list[Tensor]:
-        """Undo `join`."""
-        pieces = vectors.split([2 * grid**2 for grid in self.grids], dim=1)
-        return [piece.unflatten(1, (2, grid, grid)) for piece, grid in zip(pieces, self.grids, strict=True)]
-
-    def from_finest(self, action: Tensor) -> Tensor:
-        """Vectors (B, length) for actions (B, 2, R, R) of the last stage with fully open gates."""
-        coarser = action.new_zeros(len(action), self.length - 2 * action[0].numel())
-        return self.join([coarser, action, torch.ones_like(action)])
-
-    def rebuild(self, vectors: Tensor) -> Tensor:
-        """Compose actions (B, 2, size, size) from vectors (B, length) as the actor does, up to rounding."""
-        return compose(self.split(vectors), self.size, self.interpolation)
-
-
 class ReplayRing(ReplayBuffer):
     """stable-baselines3's replay buffer, with batches drawn from a generator of its own, and a place on a GPU.
 
     By default the fields are arrays, and batches are drawn without replacement. With ``tensors`` the fields are tensors
     on the device, and batches are drawn with replacement, so that nothing is copied from there or waited for.
 
-    With a ``composition``, actions are stored as vectors of their parts and rebuilt in each batch. With ``n_steps``
-    above 1, rewards are summed over that many steps with the discount factor ``gamma``, or until the episode or the
-    memory ends, and ``discounts`` holds the factor of what follows.
+    With an ``action_size``, actions are stored as (2, size, size). With ``n_steps`` above 1, rewards are summed over
+    that many steps with the discount factor ``gamma``, or until the episode or the memory ends, and ``discounts`` holds
+    the factor of what follows.
 
     Raises:
         ConfigError: A GPU has too little free memory for ``buffer_size`` transitions.
@@ -100,7 +51,7 @@ class ReplayRing(ReplayBuffer):
         n_envs: int = 1,
         *args: Any,
         seed: int | None = None,
-        composition: Composition | None = None,
+        action_size: int | None = None,
         n_steps: int = 1,
         gamma: float = 1.0,
         tensors: bool = False,
@@ -108,11 +59,11 @@ class ReplayRing(ReplayBuffer):
     ) -> None:
         if kwargs.get("optimize_memory_usage"):  # it takes the next row's observation for the next observation
             raise ValueError("optimize_memory_usage must be False, got True: next observations are stored")
-        stored = spaces.Box(-np.inf, np.inf, (composition.length,), np.float32) if composition else action_space
+        stored = spaces.Box(-np.inf, np.inf, (2, action_size, action_size), np.float32) if action_size else action_space
         # Of what becomes tensors, stable-baselines3 makes a single row, which has the shapes and types.
         super().__init__(n_envs if tensors else buffer_size, observation_space, stored, device, n_envs, *args, **kwargs)
         self.generator: np.random.Generator | torch.Generator = np.random.default_rng(seed)
-        self.composition, self.n_steps, self.gamma = composition, n_steps, gamma
+        self.action_size, self.n_steps, self.gamma = action_size, n_steps, gamma
         if tensors:
             self.buffer_size = max(buffer_size // n_envs, 1)
             self.generator = torch.Generator(self.device).manual_seed(seed or 0)
@@ -139,7 +90,7 @@ class ReplayRing(ReplayBuffer):
         for name, given in zip(FIELDS, row, strict=True):
             place: Tensor = getattr(self, name)[self.pos]
             values = given if isinstance(given, Tensor) else to_device(given, self.device)
-            place.copy_(values.view(place.shape))
+            place.copy_(values.reshape(place.shape))
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
@@ -167,9 +118,7 @@ class ReplayRing(ReplayBuffer):
         batch = ReplayBufferSamples(*(torch.as_tensor(values, device=self.device) for values in fields))
         if self.n_steps > 1:
             batch = batch._replace(discounts=torch.as_tensor(discounts[:, None], device=self.device))
-        if self.composition is None:
-            return batch
-        return batch._replace(actions=self.composition.rebuild(batch.actions).flatten(1))
+        return batch
 
     def _draw(self, batch_size: int) -> Any:
         """Numbers (batch_size,) of stored transitions, counted row by row."""

@@ -145,6 +145,7 @@ def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_with
     assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
     changed = {"encoder": "paper", "resolutions": (8, 16), "gradient_steps": 4, "batch_size": 64, "noise_cells": 0}
     changed |= {"max_episode_steps": None, "n_steps": 1, "weight_average": 0.0, "start_from": "run"}
+    changed |= {"buffer_size": quick.buffer_size // 2}
     assert started == replace(quick, **changed)
     asked = sac(start_from="run", noise_cells=2, gradient_steps=8)
     assert asked == replace(started, noise_cells=2, gradient_steps=8)
