@@ -7,7 +7,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from cfp.experiment.callbacks import StopCallback
+from cfp.experiment.callbacks import RunCallback
 
 
 class _Rows(BaseCallback):
@@ -43,13 +43,14 @@ def interrupt():
 @contextmanager
 def at_step(step, action):
     """Do something at a step of the run, after everything else that is done there."""
-    on_step = StopCallback._on_step
+    on_step = RunCallback._on_step
 
     def act(callback):
+        goes_on = on_step(callback)
         if callback.stage.step == step:
             action()
-        return on_step(callback)
+        return goes_on
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(StopCallback, "_on_step", act)
+        patch.setattr(RunCallback, "_on_step", act)
         yield

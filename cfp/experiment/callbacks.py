@@ -170,89 +170,21 @@ class Stage:
         self.learner.save_policy(policy_path(self.folder), description)
 
 
-class StageCallback(BaseCallback):
-    """Acts before a rollout, or at the end of a stage, where the steps have passed a multiple of ``every``.
+class RunCallback(BaseCallback):
+    """What happens between two updates of a stage: a row of the log, an evaluation, a checkpoint, the end of the run.
 
-    All earlier steps have been learned from then.
-    """
+    Each is due where the steps have passed a multiple of an option, and at the end of the stage; all earlier steps have
+    been learned from then. An evaluation keeps the best policy of the stage, if the algorithm does not keep the newest.
+    A trained policy is evaluated before its first step, and then not again until it learns. A checkpoint follows each
+    evaluation, and comes before a stop.
 
-    def __init__(self, stage: Stage, every: int) -> None:
-        super().__init__()
-        self.stage, self.every = stage, every
-        self._last = stage.step
-
-    def _act(self) -> None:
-        raise NotImplementedError
-
-    def _is_due(self) -> bool:
-        """Whether the steps since the last call have passed a multiple of `every`."""
-        last, self._last = self._last, self.stage.step
-        return self.every > 0 and self._last // self.every > last // self.every
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        if self._is_due():
-            self._act()
-
-    def _on_training_end(self) -> None:
-        self._on_rollout_start()
-
-
-class ProgressBarCallback(StageCallback):
-    """Shows on the standard error how far the run has come."""
-
-    def __init__(self, stage: Stage) -> None:
-        super().__init__(stage, 0)
-        self.values = dict[str, str]()
-        self.bar = progress_bar(disable=True)
-
-    def _on_training_start(self) -> None:
-        total, desc = self.stage.config.ends()[-1], f"stage {self.stage.number}"
-        self.bar = progress_bar(total=total, initial=self.stage.step, desc=desc)
-
-    def _on_step(self) -> bool:
-        self.bar.update(self.stage.step - self.bar.n)
-        return True
-
-    def show(self, **values: float) -> None:
-        """Show values beside the bar."""
-        self.values |= {name: f"{value:.1f}" for name, value in values.items()}
-        self.bar.set_postfix(self.values, refresh=False)  # a bar that has not appeared would end without a new line
-
-
-class LogCallback(StageCallback):
-    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, Weights & Biases if asked for."""
-
-    def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
-        super().__init__(stage, stage.config.log_every)
-        self.bar = bar
-        self._logged = stage.step
-
-    def _on_training_start(self) -> None:
-        self._clock = time.perf_counter()
-
-    def _act(self) -> None:
-        now, step, logger = time.perf_counter(), self.stage.step, self.stage.learner.logger
-        speed = (step - self._logged) / max(now - self._clock, 1e-9)
-        self._logged, self._clock = step, now
-        self.stage.learner.log_row()
-        logger.record("stage", self.stage.number)
-        logger.record("time/steps_per_second", speed, exclude="csv")
-        if (value := logger.name_to_value.get("rollout/return")) is not None:
-            self.bar.show(**{"return": value})
-        logger.dump(step)
-
-    def _on_training_end(self) -> None:
-        if self._logged < self.stage.step:
-            self._act()
-
-
-class EvaluationCallback(StageCallback):
-    """Evaluates the policy and keeps the best of the stage, if the algorithm does not keep the newest.
-
-    A trained one is evaluated before its first step, and then not again until it learns.
+    Args:
+        stage: The stage in training.
+        table: Of the evaluations of the run.
+        trackers: Where the scalars of evaluations go.
+        checkpoint: Of the run.
+        signals: Of the user who wants to stop the run.
+        on_evaluation: See `OnEvaluation`.
     """
 
     def __init__(
@@ -260,28 +192,80 @@ class EvaluationCallback(StageCallback):
         stage: Stage,
         table: CSVTable,
         trackers: Logger,
-        bar: ProgressBarCallback,
+        checkpoint: Checkpoint,
         signals: StopSignals,
         on_evaluation: OnEvaluation | None,
     ) -> None:
-        super().__init__(stage, stage.config.eval_every)
-        self.on_evaluation, self._row = on_evaluation, dict[str, Any]()
-        self.table, self.trackers, self.bar, self.signals = table, trackers, bar, signals
+        super().__init__()
+        self.stage, self.table, self.trackers = stage, table, trackers
+        self.checkpoint, self.signals, self.on_evaluation = checkpoint, signals, on_evaluation
+        self.bar, self._shown = progress_bar(disable=True), dict[str, str]()
+        self._last = self._logged = self._saved = stage.step
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
         self.evaluated = int(rows[-1]["step"]) if rows else 0  # step of the last evaluation
+        self._row = dict[str, Any]()  # of an evaluation that was not reported yet
 
     @property
     def is_missing(self) -> bool:
         """Whether the policy of the present step has not been evaluated."""
-        return self.every > 0 and self.evaluated < self.stage.step
+        return self.stage.config.eval_every > 0 and self.evaluated < self.stage.step
 
-    def _is_due(self) -> bool:
-        learner = self.stage.learner
+    def _on_training_start(self) -> None:
+        stage, self._clock = self.stage, time.perf_counter()
+        self.bar = progress_bar(total=stage.config.ends()[-1], initial=stage.step, desc=f"stage {stage.number}")
+        starts_trained = stage.learner.starts_trained and stage.config.eval_every and not self.means
+        if starts_trained or (stage.evaluation_due and self.is_missing):  # a crash may have come after its row
+            self._evaluate()
+
+    def _on_step(self) -> bool:
+        self.bar.update(self.stage.step - self.bar.n)
+        return True
+
+    def _on_rollout_start(self) -> None:
+        config, learner = self.stage.config, self.stage.learner
+        if self._has_passed(config.log_every):
+            self._log()
         initial = learner.starts_trained and learner.num_timesteps <= learner.steps_without_change
-        return super()._is_due() and not (initial and self.means)
+        if self._has_passed(config.eval_every) and not (initial and self.means):
+            self._evaluate()
+        just_evaluated = self.evaluated == self.stage.step > self._last
+        if self._has_passed(config.checkpoint_every) or just_evaluated or self.signals.number:
+            self._save()
+        self._last = self.stage.step
+        self._end()
 
-    def _act(self) -> None:
+    def _on_training_end(self) -> None:
+        if self._logged < self.stage.step:
+            self._log()
+        if self.is_missing:
+            self._evaluate()
+        if self._saved < self.stage.step:
+            self._save()
+        self._end()
+
+    def _has_passed(self, every: int) -> bool:
+        """Whether the steps since the last rollout have passed a multiple of ``every``, 0 for none."""
+        return every > 0 and self.stage.step // every > self._last // every
+
+    def _show(self, **values: float) -> None:
+        """Show values beside the progress bar."""
+        self._shown |= {name: f"{value:.1f}" for name, value in values.items()}
+        self.bar.set_postfix(self._shown, refresh=False)  # a bar that has not appeared would end without a new line
+
+    def _log(self) -> None:
+        """Write a row to the logger: ``progress.csv``, TensorBoard, Weights & Biases if asked for."""
+        now, step, logger = time.perf_counter(), self.stage.step, self.stage.learner.logger
+        speed = (step - self._logged) / max(now - self._clock, 1e-9)
+        self._logged, self._clock = step, now
+        self.stage.learner.log_row()
+        logger.record("stage", self.stage.number)
+        logger.record("time/steps_per_second", speed, exclude="csv")
+        if (value := logger.name_to_value.get("rollout/return")) is not None:
+            self._show(**{"return": value})
+        logger.dump(step)
+
+    def _evaluate(self) -> None:
         stage, config = self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
         trial = make_trial(
@@ -307,8 +291,8 @@ class EvaluationCallback(StageCallback):
         self.evaluated = stage.step
         lowest, highest = min(result.returns), max(result.returns)
         values = stage.step, stage.number, episodes, result.mean, result.std, lowest, highest, result.success
-        row = dict(zip(EVALUATION_COLUMNS, values, strict=True))
-        self.table.add(row)
+        self._row = dict(zip(EVALUATION_COLUMNS, values, strict=True))
+        self.table.add(self._row)
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
         scalars |= {f"reward/{name}": value for name, value in result.terms.items()}
         for name, value in scalars.items():
@@ -316,59 +300,19 @@ class EvaluationCallback(StageCallback):
         for name, picture in stage.learner.images().items():
             self.trackers.record(name, Image(picture, "HWC"))
         self.trackers.dump(stage.step)
-        self.bar.show(evaluated=result.mean)
-        self._row = row
+        self._show(evaluated=result.mean)
 
-    def report(self) -> None:
-        """Pass on the row of the last evaluation, once."""
+    def _save(self) -> None:
+        stage = self.stage
+        if not (stage.learner.keeps_best and stage.config.eval_every and self.means):
+            stage.save_policy()
+        self.checkpoint.save(stage.learner, stage.config, stage.offset, stage.evaluation_due)
+        self._saved = stage.step
+
+    def _end(self) -> None:
+        """Pass on the row of an evaluation, and stop: after the checkpoint, from which the run then goes on."""
         row, self._row = self._row, {}
         if row and self.on_evaluation is not None:
             self.on_evaluation(row)
-
-    def _on_training_start(self) -> None:
-        starts_trained = self.stage.learner.starts_trained and self.every and not self.means
-        if starts_trained or (self.stage.evaluation_due and self.is_missing):  # a crash may have come after its row
-            self._act()
-
-    def _on_training_end(self) -> None:
-        if self.is_missing:
-            self._act()
-
-
-class CheckpointCallback(StageCallback):
-    """Writes a checkpoint: at intervals, after each evaluation, before the run is stopped, and at the end."""
-
-    def __init__(self, stage: Stage, checkpoint: Checkpoint, evaluation: EvaluationCallback, signals: StopSignals):
-        super().__init__(stage, stage.config.checkpoint_every)
-        self.checkpoint, self.evaluation, self.signals = checkpoint, evaluation, signals
-        self._saved = stage.step
-
-    def _act(self) -> None:
-        stage = self.stage
-        if not (stage.learner.keeps_best and self.evaluation.every and self.evaluation.means):
-            stage.save_policy()
-        self.checkpoint.save(stage.learner, stage.config, stage.offset, stage.evaluation_due)
-        self._saved = self.stage.step
-
-    def _on_rollout_start(self) -> None:
-        just_evaluated = self.evaluation.evaluated == self.stage.step > self._last
-        if self._is_due() or just_evaluated or self.signals.number:
-            self._act()
-        self.evaluation.report()  # after the checkpoint, so that a run that this ends goes on from there
-
-    def _on_training_end(self) -> None:
-        if self._saved < self.stage.step:
-            self._act()
-        self.evaluation.report()
-
-
-class StopCallback(StageCallback):
-    """Stops the run when the user wants to."""
-
-    def __init__(self, stage: Stage, signals: StopSignals) -> None:
-        super().__init__(stage, 0)
-        self.signals = signals
-
-    def _on_rollout_start(self) -> None:
         if self.signals.number:
             raise Stopped(self.signals.number)

@@ -11,7 +11,6 @@ from typing import Any
 
 import matplotlib.style
 import numpy as np
-from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
 from cfp.config import RunConfig, to_json
@@ -21,14 +20,10 @@ from cfp.evaluation.page import draw_curve, write_figure, write_page
 from cfp.evaluation.returns import compare, explain, format_table, name_in_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.callbacks import (
-    CheckpointCallback,
-    EvaluationCallback,
-    LogCallback,
     OnEvaluation,
-    ProgressBarCallback,
     ProgressTable,
+    RunCallback,
     Stage,
-    StopCallback,
     check_wandb,
     make_trackers,
 )
@@ -176,26 +171,17 @@ class TrainingRun:
 
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
-        bar = ProgressBarCallback(stage)
-        evaluation = EvaluationCallback(stage, self.evaluations, self.trackers, bar, self.signals, self.on_evaluation)
+        places = self.evaluations, self.trackers, self.checkpoint
+        callback = RunCallback(stage, *places, self.signals, self.on_evaluation)
         # A process killed after the last step but before the last evaluation still has to evaluate.
-        if not stage.steps_left and not evaluation.is_missing:
+        if not stage.steps_left and not callback.is_missing:
             return
         for name in REPORT:  # of an earlier end of the run
             (self.folder / name).unlink(missing_ok=True)
-        callbacks = CallbackList(
-            [
-                bar,
-                LogCallback(stage, bar),
-                evaluation,
-                CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
-                StopCallback(stage, self.signals),
-            ]
-        )
         try:
-            stage.learner.learn(stage.steps_left, callbacks, None, reset_num_timesteps=False)
+            stage.learner.learn(stage.steps_left, callback, None, reset_num_timesteps=False)
         finally:
-            bar.bar.close()
+            callback.bar.close()
 
     def finish(self) -> None:
         """After training: print the final table, and write ``results.json``, curve, video and page."""

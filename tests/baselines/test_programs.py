@@ -18,7 +18,7 @@ from cfp import evaluate, robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.callbacks import EvaluationCallback
+from cfp.experiment.callbacks import RunCallback
 from cfp.policy import describe_run, read_policy
 from cfp.presets import sac_preset
 from cfp.tables import read_table
@@ -193,14 +193,14 @@ def test_fit_is_the_command_line(finished, tmp_path):
 
 def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
     """The policy is the newest, not the best: as long as the episode, whatever its evaluations were."""
-    act = EvaluationCallback._act
+    act = RunCallback._evaluate
 
     def crash(callback):
         if callback.stage.step == 8:
             raise RuntimeError("killed")
         act(callback)
 
-    monkeypatch.setattr(EvaluationCallback, "_act", crash)
+    monkeypatch.setattr(RunCallback, "_evaluate", crash)
     with pytest.raises(RuntimeError, match="killed"):
         run("mpc", tmp_path)
     monkeypatch.undo()

@@ -120,14 +120,14 @@ def test_run_stopped_in_an_evaluation_repeats_it(finished, tmp_path):
         patch.setattr(callbacks, "make_trial", stop)
         assert run(folder) == 128 + signal.SIGTERM
     assert read_table(folder / "evaluations.csv") == []
-    evaluate_first = callbacks.EvaluationCallback._on_training_start
+    evaluate_first = callbacks.RunCallback._on_training_start
 
     def crash(callback):
         evaluate_first(callback)
         raise RuntimeError("killed")
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="killed"):
-        patch.setattr(callbacks.EvaluationCallback, "_on_training_start", crash)
+        patch.setattr(callbacks.RunCallback, "_on_training_start", crash)
         resume(folder)
     with at_step(66, interrupt):
         assert resume(folder) == 128 + signal.SIGINT
@@ -197,7 +197,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder
     ("step", "says"), [(50, "the last checkpoint is untouched"), (10, "there is no checkpoint yet")]
 )
 def test_a_training_that_diverges_says_whether_a_checkpoint_is_left(tmp_path, capsys, step, says):
-    folder, on_step = tmp_path / "run", callbacks.StopCallback._on_step
+    folder, on_step = tmp_path / "run", callbacks.RunCallback._on_step
 
     def act(callback):
         if callback.stage.step == step:
@@ -205,7 +205,7 @@ def test_a_training_that_diverges_says_whether_a_checkpoint_is_left(tmp_path, ca
         return on_step(callback)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callbacks.StopCallback, "_on_step", act)
+        patch.setattr(callbacks.RunCallback, "_on_step", act)
         assert run(folder) == 1
     error = capsys.readouterr().err  # without a bar, which is for long trainings where there is no terminal
     assert error.startswith("error: ") and error.endswith(f"; {says}\n")
