@@ -8,7 +8,6 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
-from unittest.mock import Mock
 
 import cv2
 import gymnasium
@@ -19,7 +18,6 @@ from PIL import Image
 from tiny import SMALL
 
 import dittogym
-from dittogym import files
 from dittogym.render.film import VideoUnavailable, write_film
 from dittogym.render.frame import pace
 from dittogym.render.recording import Recording, as_function
@@ -92,37 +90,6 @@ def test_films(recording: Recording, tmp_path, suffix: str) -> None:
     assert [each.name for each in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("suffix", ["webp", "mp4"])
-def test_a_film_that_fails_leaves_the_old_file(tmp_path, suffix: str) -> None:
-    def frames():
-        yield from np.zeros((3, 32, 32, 3), np.uint8)
-        raise ValueError("the robot is gone")
-
-    path = tmp_path / f"film.{suffix}"
-    path.write_bytes(b"old")
-    with pytest.raises(ValueError, match="the robot is gone"):
-        write_film(path, frames(), 10)
-    assert [each.name for each in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
-
-
-@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
-def test_two_may_write_the_same_film(tmp_path, suffix: str) -> None:
-    if suffix == ".mp4":
-        pytest.importorskip("imageio_ffmpeg")
-    path = tmp_path / f"film{suffix}"
-
-    def pictures(grey: int, meanwhile: bool) -> Iterator[np.ndarray]:
-        yield np.full((64, 64, 3), grey, np.uint8)
-        if meanwhile:
-            write_film(path, pictures(50, meanwhile=False), 10.0)
-        yield np.full((64, 64, 3), grey, np.uint8)
-
-    write_film(path, pictures(200, meanwhile=True), 10.0)
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    picture = cv2.VideoCapture(str(path)).read()[1] if suffix == ".mp4" else np.asarray(Image.open(path))
-    assert picture.mean() == pytest.approx(200, abs=3)
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves pipes open then
 @pytest.mark.parametrize("says", ["exit 1", "[ $1 = -y ] && cat > /dev/null; exit 1"])
 def test_an_ffmpeg_that_fails_is_named(tmp_path, monkeypatch: pytest.MonkeyPatch, says: str) -> None:
@@ -136,19 +103,6 @@ def test_an_ffmpeg_that_fails_is_named(tmp_path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(VideoUnavailable, match="ffmpeg"):
         write_film(tmp_path / "film.mp4", pictures, 10.0)
     assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]
-
-
-@pytest.mark.parametrize("suffix", [".html", ".png", ".webp"])
-def test_a_program_that_is_stopped_leaves_the_old_file(
-    recording: Recording, tmp_path, monkeypatch, suffix: str
-) -> None:
-    """Up to the last moment, in which the new file takes its place."""
-    path = tmp_path / f"film{suffix}"
-    path.write_text("old")
-    monkeypatch.setattr(files.os, "replace", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        recording.save(path, size=16, rate=5)
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_pictures_of_a_film(recording: Recording) -> None:
