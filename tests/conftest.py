@@ -37,11 +37,19 @@ def short() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
-def torch_settings() -> Iterator[None]:
-    """Tests may change them. They begin with one thread, as they run in as many processes as there are cores."""
-    threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Tests run in as many processes as there are cores: more threads than that wait for each other."""
+    before = torch.get_num_threads()
     torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def restored_settings() -> Iterator[None]:
+    """Tests may change torch's threads and default type."""
+    threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
     yield
     torch.set_num_threads(threads)
     torch.set_default_dtype(dtype)

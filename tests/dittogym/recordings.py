@@ -151,7 +151,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.Env, recorded: torch.
     ours = place(patch, centre_in_window(spec.patch_centre, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
     grid = particles_to_grid(scene, start.particles.components())
-    along = torch.stack(interpolate(grid.nodes, scene.actuation), -1)[0]
+    along = torch.stack(interpolate(grid.stencil, scene.actuation), -1)[0]
 
     def on_nodes(values: torch.Tensor) -> torch.Tensor:
         return values.view(solver.grid.width, solver.grid.width)[PAD:-PAD, PAD:-PAD]
