@@ -193,8 +193,9 @@ def has_tangents(tensors: Iterable[Tensor | None]) -> bool:
 
 def transforming() -> bool:
     """Return whether a transform of ``torch.func`` or a trace of ``make_fx`` is active."""
-    # torch.func has no public query for this.
-    return bool(torch._C._are_functorch_transforms_active()) or get_proxy_mode() is not None
+    # torch.func has no public query for this. torch.compile cannot compile that of make_fx.
+    traced = not torch.compiler.is_compiling() and get_proxy_mode() is not None
+    return bool(torch._C._are_functorch_transforms_active()) or traced
 
 
 def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

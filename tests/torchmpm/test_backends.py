@@ -229,7 +229,6 @@ def test_cuda_equals_cpu() -> None:
     assert_close(on_cuda.to("cpu"), on_cpu, 1e-10)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch's own about what it cannot trace
 def test_a_compiled_function_holds_an_eager_step_whole_and_runs_around_other_backends() -> None:
     state, drive = lively(5), normal(1, 2, 16, 16, seed=1)
