@@ -19,14 +19,7 @@ from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.page import draw_curve, write_figure, write_page
 from cfp.evaluation.returns import compare, explain, format_table, name_in_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
-from cfp.experiment.callbacks import (
-    OnEvaluation,
-    ProgressTable,
-    RunCallback,
-    Stage,
-    check_wandb,
-    make_trackers,
-)
+from cfp.experiment.callbacks import OnEvaluation, ProgressTable, RunCallback, Stage, check_wandb, make_trackers
 from cfp.experiment.checkpoint import Checkpoint, check_same
 from cfp.experiment.cli import StopSignals
 from cfp.experiment.folder import holds_progress, holds_run, policy_files, policy_path
@@ -171,8 +164,9 @@ class TrainingRun:
 
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
-        places = self.evaluations, self.trackers, self.checkpoint
-        callback = RunCallback(stage, *places, self.signals, self.on_evaluation)
+        callback = RunCallback(
+            stage, self.evaluations, self.trackers, self.checkpoint, self.signals, self.on_evaluation
+        )
         # A process killed after the last step but before the last evaluation still has to evaluate.
         if not stage.steps_left and not callback.is_missing:
             return
